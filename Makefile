@@ -1,0 +1,36 @@
+# Every target does the set-up that it needs; `make help` lists them.
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint clean
+
+PYTHON := .venv/bin/python
+ARGS ?=
+WORKERS ?= 2
+
+# Where the machine's own ROS 2 is sourced, the workspace built on it has to be sourced too.
+ifneq ($(ROS_DISTRO),)
+RUN := source ros2_ws/install/local_setup.bash &&
+endif
+# Only the pytest plugins named here are loaded: some that come with ROS break recent pytest.
+PYTEST := PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(PYTHON) -m pytest -p xdist -p pytest_timeout
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+setup: ## create .venv with pinned packages and build the ROS workspace
+	@tools/setup.sh
+
+demo: setup ## drive the real maze over ROS: three policies, five goals, a table and a picture
+	@$(RUN) $(PYTHON) -m tools.demo $(ARGS)
+
+test: setup ## run all tests; ARGS='-k filter' passes options to pytest
+	@$(RUN) $(PYTEST) -n $(WORKERS) $(ARGS)
+
+lint: setup ## check style, formatting and types
+	@$(PYTHON) -m ruff check .
+	@$(PYTHON) -m ruff format --check .
+	@$(PYTHON) -m mypy
+
+clean: ## remove .venv, the built workspace, caches and out/
+	@rm -rf .venv .setup.lock ros2_ws/build ros2_ws/install ros2_ws/log out \
+		*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
