@@ -1,0 +1,152 @@
+"""Test-time training: from a base policy to the expert for one query (paper, section 3.2)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import time
+
+import numpy as np
+
+from metagcttt_core.adaptation.batches import QueryBatches
+from metagcttt_core.adaptation.config import TTTConfig
+from metagcttt_core.adaptation.inner_loop import run_inner_loop
+from metagcttt_core.agents.agent import Agent
+from metagcttt_core.data.dataset import TrajectoryDataset
+from metagcttt_core.retrieval.support import SupportSet
+
+
+@dataclass(frozen=True)
+class Adaptation:
+    """The outcome of adapting to one query.
+
+    Attributes:
+        agent: The expert; the base agent itself when not accepted.
+        train_losses: Loss of each step's batch before the step.
+        test_losses: Held-out loss after 0..K steps, with early stopping.
+        best_step: Number of gradient steps behind `agent`'s weights.
+        accepted: Whether `agent` differs from the base agent.
+        reason: Why it was not accepted; empty if it was.
+        seconds: Time it took.
+    """
+
+    agent: Agent
+    train_losses: list[float]
+    test_losses: list[float]
+    best_step: int
+    accepted: bool
+    reason: str
+    seconds: float
+
+
+def adapt(
+    agent: Agent,
+    dataset: TrajectoryDataset,
+    support: SupportSet,
+    goal: np.ndarray,
+    config: TTTConfig,
+    seed: int = 0,
+    *,
+    optimizer_state: dict | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> Adaptation:
+    """Take K steps on the support set, with the actor's goal fixed to the query's goal.
+
+    Args:
+        agent: The base agent; its weights are bit-equal afterwards.
+        dataset: The dataset that `support` indexes.
+        support: From `TrajectoryFilter.query`.
+        goal: (obs_dim,) the query's goal g.
+        config: K, learning rate, batch size and the rest.
+        seed: Of the batches and the held-out split.
+        optimizer_state: The pre-trained optimiser state, for
+            `config.optimizer_state='pretrained'`.
+        should_stop: Asked before every gradient step; true cancels.
+
+    Returns:
+        The expert and its losses. An empty support, zero steps or, with early stopping, a held-out
+        loss that only got worse gives the base agent, not accepted, with the reason.
+
+    Raises:
+        AdaptationCancelled: When `should_stop` returned true.
+        ValueError: If agent, dataset and goal do not fit together.
+    """
+    began = time.perf_counter()
+    _check(agent, dataset, goal, config, optimizer_state)
+
+    def base(reason: str, test_losses: list[float], train_losses: list[float]) -> Adaptation:
+        seconds = time.perf_counter() - began
+        return Adaptation(agent, train_losses, test_losses, 0, False, reason, seconds)
+
+    if config.steps == 0:
+        return base('no adaptation steps were asked for', [], [])
+    split_seed, batch_seed = np.random.SeedSequence(seed).spawn(2)
+    rng = np.random.default_rng(batch_seed)
+    train, test = support, None
+    if config.early_stopping:
+        train, test = support.split(
+            config.test_fraction, config.max_test, np.random.default_rng(split_seed)
+        )
+
+    def batches_of(part: SupportSet) -> QueryBatches:
+        return QueryBatches(
+            agent,
+            dataset,
+            part.indices,
+            goal,
+            fix_actor_goal=config.fix_actor_goal,
+            ratio=config.ratio,
+        )
+
+    train_batches = batches_of(train)
+    if not len(train_batches.rows):
+        return base('the filtered dataset is empty', [], [])
+    test_batch = None
+    if test is not None:
+        test_batches = batches_of(test)
+        if not len(test_batches.rows):
+            return base('the filtered dataset is too small to hold out a test split', [], [])
+        test_batch = test_batches.all(rng)
+    state = optimizer_state if config.optimizer_state == 'pretrained' else None
+    result = run_inner_loop(
+        agent,
+        (train_batches.sample(config.batch_size, rng) for _ in range(config.steps)),
+        lr=config.lr,
+        optimizer=config.optimizer,
+        optimizer_state=state,
+        test_batch=test_batch,
+        actor_only=config.actor_only,
+        should_stop=should_stop,
+    )
+    if result.best_step == 0:
+        return base(
+            'the held-out loss never fell below its start', result.test_losses, result.train_losses
+        )
+    return Adaptation(
+        agent=result.agent,
+        train_losses=result.train_losses,
+        test_losses=result.test_losses,
+        best_step=result.best_step,
+        accepted=True,
+        reason='',
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _check(
+    agent: Agent,
+    dataset: TrajectoryDataset,
+    goal: np.ndarray,
+    config: TTTConfig,
+    optimizer_state: dict | None,
+) -> None:
+    for name in ('obs_dim', 'act_dim'):
+        if getattr(agent, name) != getattr(dataset, name):
+            raise ValueError(
+                f'{name} is {getattr(agent, name)} for the agent '
+                f'and {getattr(dataset, name)} for the dataset; they must match'
+            )
+    if np.shape(goal) != (agent.obs_dim,):
+        raise ValueError(f'goal must have shape ({agent.obs_dim},), got {np.shape(goal)}')
+    if not np.isfinite(goal).all():
+        raise ValueError(f'goal holds a non-finite value: {goal}')
+    if config.optimizer_state == 'pretrained' and optimizer_state is None:
+        raise ValueError('optimizer_state=pretrained needs the optimiser state of pre-training')

@@ -1,0 +1,225 @@
+"""What every goal-conditioned agent offers."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+import copy
+import math
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from pydantic import Field
+import torch
+from torch import nn, Tensor
+
+from metagcttt_core.agents.networks import MLP
+from metagcttt_core.config.settings import Settings
+from metagcttt_core.data.relabel import GoalConfig
+
+TensorBatch = dict[str, Tensor]
+_HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
+
+
+class AgentSettings(Settings):
+    """Settings that all agents share."""
+
+    hidden: tuple[int, ...] = Field(
+        (512, 512, 512), min_length=1, description='units of each hidden layer'
+    )
+    const_std: bool = Field(
+        True, description='unit standard deviation of the actor (else learned)'
+    )
+    goals: GoalConfig = GoalConfig()
+
+
+class Agent(nn.Module, ABC):
+    """A policy pi(a | s, g) with the losses that train it.
+
+    Attributes:
+        obs_dim, act_dim: Widths of an observation (and goal) and of an action.
+        settings: The agent's settings, defaults resolved.
+        metadata: Facts that travel with the weights (`environment`, `history`, ...).
+    """
+
+    name: ClassVar[str]
+    settings_type: ClassVar[type[AgentSettings]]
+
+    def __init__(
+        self, obs_dim: int, act_dim: int, settings: AgentSettings, generator: torch.Generator
+    ) -> None:
+        """Build the actor; subclasses add value networks."""
+        super().__init__()
+        for field, value in (('obs_dim', obs_dim), ('act_dim', act_dim)):
+            if value < 1:
+                raise ValueError(f'{field} must be at least 1, got {value}')
+        self.obs_dim = obs_dim
+        self.act_dim = act_dim
+        self.settings = settings
+        self.metadata: dict[str, Any] = {}
+        self.actor = MLP(
+            2 * obs_dim,
+            settings.hidden,
+            act_dim,
+            head='mean',
+            head_scale=0.01,
+            generator=generator,
+        )
+        if not settings.const_std:
+            self.actor.log_stds = nn.Parameter(torch.zeros(act_dim))
+
+    @abstractmethod
+    def losses(
+        self, batch: TensorBatch, *, actor_only: bool = False
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The training loss of a batch and its named parts.
+
+        Args:
+            batch: Tensors by OGBench's keys, as `GoalRelabeller` makes them.
+            actor_only: Leave out the terms that do not train the actor.
+        """
+
+    def update_targets(self) -> None:
+        """Move the networks that trail others; called with each full update, before its step."""
+
+    @property
+    def value_fn(self) -> Callable[[np.ndarray, np.ndarray], np.ndarray] | None:
+        """V(observations (n, obs_dim), goal (obs_dim,)) -> (n,), or None without a critic."""
+        return None
+
+    def trained_parameters(self, *, actor_only: bool = False) -> Iterator[nn.Parameter]:
+        """The parameters an optimiser steps on."""
+        module = self.actor if actor_only else self
+        return (parameter for parameter in module.parameters() if parameter.requires_grad)
+
+    def clone(self) -> Self:
+        """An independent copy with equal weights."""
+        return copy.deepcopy(self)
+
+    def log_prob(
+        self, observations: Tensor, goals: Tensor, actions: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Log-density of actions under the policy, (B,), and the policy's means, (B, act_dim)."""
+        mean = self.actor(torch.cat([observations, goals], dim=-1))
+        error = actions - mean
+        if self.settings.const_std:
+            return (-0.5 * error.square() - _HALF_LOG_TWO_PI).sum(-1), mean
+        log_std = self.actor.log_stds.clamp(-5, 2)
+        return (-0.5 * (error / log_std.exp()).square() - log_std - _HALF_LOG_TWO_PI).sum(-1), mean
+
+    @torch.inference_mode()
+    def act(
+        self,
+        observation: np.ndarray,
+        goal: np.ndarray,
+        *,
+        temperature: float = 0.0,
+        rng: np.random.Generator | None = None,
+    ) -> np.ndarray:
+        """The action for one observation or a batch: the policy's mode, clipped to [-1, 1].
+
+        Args:
+            observation: (obs_dim,) or (n, obs_dim), finite.
+            goal: (obs_dim,), or (n, obs_dim) for a batch.
+            temperature: Scale of the standard deviation; 0 acts deterministically.
+            rng: Source of the noise; needed when the temperature is above 0.
+
+        Returns:
+            (act_dim,) or (n, act_dim) float32.
+
+        Raises:
+            ValueError: For a wrong width or a non-finite value.
+        """
+        observation = _checked('observation', observation, self.obs_dim)
+        goal = _checked('goal', goal, self.obs_dim)
+        if goal.ndim < observation.ndim:
+            goal = np.broadcast_to(goal, observation.shape)
+        if goal.shape != observation.shape:
+            raise ValueError(
+                f'goal of shape {goal.shape} does not fit observation of shape {observation.shape}'
+            )
+        inputs = torch.from_numpy(np.concatenate([observation, goal], axis=-1))
+        mean = self.actor(inputs.to(self.device)).cpu().numpy()
+        if temperature > 0:
+            if rng is None:
+                raise ValueError('acting with a temperature above 0 needs an rng')
+            std = (
+                1.0
+                if self.settings.const_std
+                else self.actor.log_stds.clamp(-5, 2).exp().cpu().numpy()
+            )
+            mean = mean + temperature * std * rng.standard_normal(mean.shape, dtype=np.float32)
+        return np.clip(mean, -1, 1)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return next(self.parameters()).device
+
+    def tensors(self, batch: Mapping[str, np.ndarray]) -> TensorBatch:
+        """A batch as tensors on the agent's device."""
+        return {
+            key: torch.from_numpy(np.ascontiguousarray(value)).to(self.device)
+            for key, value in batch.items()
+        }
+
+    @torch.no_grad()
+    def import_reference_parameters(self, mapping: Mapping[str, np.ndarray]) -> None:
+        """Load weights named as in OGBench's reference implementation.
+
+        Args:
+            mapping: Arrays by name `<net>.<layer>.<tensor>`: `kernel` (fan_in, fan_out) and
+                `bias` of `fc0`,
+                `fc1`, ..., `mean` (actor) or `out`; `scale` and `bias` of `ln0`, ...
+
+        Raises:
+            ValueError: If a name is missing or unknown, or a shape is wrong. No weight has
+                changed then.
+        """
+        own = self.state_dict(keep_vars=True)
+        expected = {_reference_name(name, tensor): tensor for name, tensor in own.items()}
+        missing, unknown = (
+            sorted(expected.keys() - mapping.keys()),
+            sorted(mapping.keys() - expected.keys()),
+        )
+        if missing or unknown:
+            raise ValueError(
+                f'reference parameters do not fit a {self.name} agent: '
+                f'missing {missing or "none"}, unknown {unknown or "none"}'
+            )
+        arrays = {name: np.asarray(mapping[name], dtype=np.float32) for name in expected}
+        for name, tensor in expected.items():
+            shape = tuple(tensor.shape)[::-1] if name.endswith('.kernel') else tuple(tensor.shape)
+            if arrays[name].shape != shape:
+                raise ValueError(
+                    f'reference parameter {name} must have shape {shape}, got {arrays[name].shape}'
+                )
+            if not np.isfinite(arrays[name]).all():
+                raise ValueError(f'reference parameter {name} holds a non-finite value')
+        for name, tensor in expected.items():
+            tensor.copy_(
+                torch.from_numpy(arrays[name].T if name.endswith('.kernel') else arrays[name])
+            )
+
+    def export_reference_parameters(self) -> dict[str, np.ndarray]:
+        """The weights under the names of `import_reference_parameters`; its inverse."""
+        exported = {}
+        for own_name, tensor in self.state_dict().items():
+            name = _reference_name(own_name, tensor)
+            array = tensor.cpu().numpy().copy()
+            exported[name] = array.T if name.endswith('.kernel') else array
+        return exported
+
+
+def _reference_name(name: str, tensor: Tensor) -> str:
+    layer, _, kind = name.rpartition('.')
+    if kind != 'weight':
+        return name
+    return f'{layer}.kernel' if tensor.ndim == 2 else f'{layer}.scale'
+
+
+def _checked(name: str, values: np.ndarray, width: int) -> np.ndarray:
+    array = np.asarray(values, dtype=np.float32)
+    if array.ndim not in (1, 2) or array.shape[-1] != width:
+        raise ValueError(f'{name} must have shape ({width},) or (n, {width}), got {array.shape}')
+    if not np.isfinite(array).all():
+        raise ValueError(f'{name} holds a non-finite value')
+    return array

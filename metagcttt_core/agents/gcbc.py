@@ -1,0 +1,32 @@
+"""Goal-conditioned behavioural cloning (paper, equation 2)."""
+
+from typing import ClassVar
+
+from torch import Tensor
+
+from metagcttt_core.agents.agent import Agent, AgentSettings, TensorBatch
+from metagcttt_core.data.relabel import GoalConfig
+
+
+class GCBCSettings(AgentSettings):
+    """Settings of GCBC: actor goals are later states of the trajectory; no value goals."""
+
+    goals: GoalConfig = GoalConfig(value=None)
+
+
+class GCBC(Agent):
+    """Maximises the likelihood of the dataset's actions towards goals reached later."""
+
+    name: ClassVar[str] = 'gcbc'
+    settings_type: ClassVar[type[AgentSettings]] = GCBCSettings
+
+    def losses(
+        self, batch: TensorBatch, *, actor_only: bool = False
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Negative mean log-likelihood (`bc`); `mse` is the mean's squared error."""
+        log_prob, mean = self.log_prob(
+            batch['observations'], batch['actor_goals'], batch['actions']
+        )
+        bc_loss = -log_prob.mean()
+        mse = (mean.detach() - batch['actions']).square().mean()
+        return bc_loss, {'bc': bc_loss.detach(), 'mse': mse}

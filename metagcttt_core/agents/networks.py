@@ -1,0 +1,59 @@
+"""The multilayer perceptron of OGBench's agents."""
+
+import math
+
+import torch
+from torch import nn, Tensor
+from torch.nn import functional
+
+
+class MLP(nn.Module):
+    """Linear, GELU (tanh form) and optionally layer norm per hidden layer, then a linear head.
+
+    Kernels start uniform on [-L, L] with L = sqrt(6 c / (fan_in + fan_out)), c = 1 (`head_scale`
+    for the head); biases start at 0.
+    """
+
+    def __init__(
+        self,
+        in_dim: int,
+        hidden: tuple[int, ...],
+        out_dim: int,
+        *,
+        head: str = 'out',
+        head_scale: float = 1.0,
+        layer_norm: bool = False,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        """Build the layers `fc0`, `ln0`, ... and `head`."""
+        super().__init__()
+        self.head_name = head
+        self.num_hidden = len(hidden)
+        self.layer_norm = layer_norm
+        widths = (in_dim, *hidden)
+        for index in range(len(hidden)):
+            self.add_module(
+                f'fc{index}', _linear(widths[index], widths[index + 1], 1.0, generator)
+            )
+            if layer_norm:
+                self.add_module(f'ln{index}', nn.LayerNorm(widths[index + 1], eps=1e-6))
+        self.add_module(head, _linear(widths[-1], out_dim, head_scale, generator))
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Map (..., in_dim) to (..., out_dim)."""
+        x = inputs
+        for index in range(self.num_hidden):
+            x = functional.gelu(self.get_submodule(f'fc{index}')(x), approximate='tanh')
+            if self.layer_norm:
+                x = self.get_submodule(f'ln{index}')(x)
+        return self.get_submodule(self.head_name)(x)
+
+
+def _linear(
+    fan_in: int, fan_out: int, scale: float, generator: torch.Generator | None
+) -> nn.Linear:
+    layer = nn.utils.skip_init(nn.Linear, fan_in, fan_out)
+    limit = math.sqrt(6 * scale / (fan_in + fan_out))
+    nn.init.uniform_(layer.weight, -limit, limit, generator=generator)
+    nn.init.zeros_(layer.bias)
+    return layer

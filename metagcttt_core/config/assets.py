@@ -1,0 +1,22 @@
+"""Where the committed checkpoints and datasets are."""
+
+import os
+from pathlib import Path
+
+
+def assets_dir() -> Path:
+    """The folder of committed assets.
+
+    `METAGCTTT_ASSETS` names it where the package is not installed from a checkout.
+
+    Raises:
+        FileNotFoundError: If there is no such folder.
+    """
+    override = os.environ.get('METAGCTTT_ASSETS')
+    folder = Path(override) if override else Path(__file__).resolve().parents[2] / 'assets'
+    if not folder.is_dir():
+        raise FileNotFoundError(
+            f'no assets folder at {folder}: install from a checkout (pip install -e .) '
+            'or set METAGCTTT_ASSETS to the assets folder'
+        )
+    return folder

@@ -1,0 +1,14 @@
+"""Offline datasets and the goals drawn from them."""
+
+from metagcttt_core.data.dataset import TrajectoryDataset
+from metagcttt_core.data.errors import DatasetError
+from metagcttt_core.data.relabel import Batch, GoalConfig, GoalDistribution, GoalRelabeller
+
+__all__ = [
+    'Batch',
+    'DatasetError',
+    'GoalConfig',
+    'GoalDistribution',
+    'GoalRelabeller',
+    'TrajectoryDataset',
+]

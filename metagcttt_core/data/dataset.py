@@ -1,0 +1,237 @@
+"""Trajectories in memory or memory-mapped: the offline dataset D."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from metagcttt_core.data import npz
+from metagcttt_core.data.errors import DatasetError
+
+_CHUNK_ROWS = 1 << 20
+
+
+class TrajectoryDataset:
+    """Rows of states and actions, trajectories of any length stored back to back.
+
+    A trajectory of T transitions is stored as T + 1 rows; only its last row is terminal and has no
+    successor::
+
+        row            0    1    2    3    4    5    6
+        observation   s0   s1   s2   s3 | s0   s1   s2
+        action        a0   a1   a2   -  | a0   a1   -      ('-': stored, leads nowhere)
+        terminal       F    F    F    T |  F    F    T
+        episode_starts 0                   4
+        episode_ends                  3              6      (inclusive)
+
+    Attributes:
+        observations: (N, obs_dim) float32.
+        actions: (N, act_dim) float32.
+        terminals: (N,) bool, true on the last row of each trajectory.
+        extras: Further per-row arrays of the file, such as `qpos` and `qvel`, by name.
+        episode_starts: (E,) int64, the first row of each trajectory.
+        episode_ends: (E,) int64, the last row of each trajectory (inclusive).
+        source: The file it was read from, if any.
+    """
+
+    def __init__(
+        self,
+        observations: np.ndarray,
+        actions: np.ndarray,
+        terminals: np.ndarray,
+        extras: Mapping[str, np.ndarray] | None = None,
+        source: Path | None = None,
+    ) -> None:
+        """Wrap checked arrays; `from_arrays` and `load` check them."""
+        self.observations = observations
+        self.actions = actions
+        self.terminals = terminals
+        self.extras = dict(extras or {})
+        self.source = source
+        self.episode_ends = np.flatnonzero(terminals).astype(np.int64)
+        self.episode_starts = np.concatenate([[0], self.episode_ends[:-1] + 1]).astype(np.int64)
+        # Transitions (rows with a successor) before each trajectory, for drawing one uniformly.
+        self._transition_offsets = self.episode_starts - np.arange(len(self.episode_starts))
+
+    @classmethod
+    def from_arrays(
+        cls,
+        observations: np.ndarray,
+        actions: np.ndarray,
+        terminals: np.ndarray,
+        extras: Mapping[str, np.ndarray] | None = None,
+        *,
+        source: Path | None = None,
+    ) -> Self:
+        """A dataset over the given rows, after checking every one of them.
+
+        Args:
+            observations: (N, obs_dim) real numbers; kept as they are when float32, else converted.
+            actions: (N, act_dim) real numbers.
+            terminals: (N,) of booleans or zeros and ones, true on the last row of each trajectory.
+            extras: Further arrays with N rows, stored and saved along.
+            source: The file to name in errors.
+
+        Raises:
+            DatasetError: For a wrong rank, length or type, a non-finite value (with its row), or a
+                last row that is not terminal.
+        """
+        where = str(source) if source else 'dataset'
+        observations = _matrix(observations, 'observations', where)
+        actions = _matrix(actions, 'actions', where)
+        terminals = _flags(terminals, where)
+        extras = {name: np.asanyarray(array) for name, array in (extras or {}).items()}
+        rows = len(observations)
+        if rows == 0:
+            raise DatasetError(f'{where}: observations has no rows')
+        for name, array in {'actions': actions, 'terminals': terminals, **extras}.items():
+            if array.ndim == 0 or len(array) != rows:
+                got = 'a scalar' if array.ndim == 0 else f'{len(array)} rows'
+                raise DatasetError(
+                    f'{where}: {name} has {got} but observations has {rows}; they must match'
+                )
+        if not terminals[-1]:
+            raise DatasetError(
+                f'{where}: terminals is false on the last row ({rows - 1}); '
+                'the last row of every trajectory must be terminal'
+            )
+        for name, array in {'observations': observations, 'actions': actions, **extras}.items():
+            _check_finite(array, name, where)
+        return cls(observations, actions, terminals, extras, source)
+
+    @classmethod
+    def load(cls, path: str | Path, *, memory_map: bool | None = None) -> Self:
+        """Read a dataset in OGBench's npz format.
+
+        Args:
+            path: The `.npz` file. Its arrays `observations`, `actions` and `terminals` are
+                required.
+            memory_map: Keep the rows on disk (unpacked once, beside the file) instead of in
+                memory. By default, for files that unpack to more than `npz.MEMORY_MAP_BYTES`.
+
+        Raises:
+            DatasetError: If the file is missing, truncated, pickled, or its content is refused by
+                `from_arrays`; the message names the file, the field and the row.
+        """
+        path = Path(path)
+        arrays = npz.read_arrays(
+            path, required=('observations', 'actions', 'terminals'), memory_map=memory_map
+        )
+        fields = {name: arrays.pop(name) for name in ('observations', 'actions', 'terminals')}
+        arrays.pop('next_observations', None)  # always the following row
+        return cls.from_arrays(**fields, extras=arrays, source=path)
+
+    def save(self, path: str | Path) -> None:
+        """Write the dataset as OGBench's compressed npz, atomically; the inverse of `load`."""
+        npz.write_arrays(
+            Path(path),
+            {
+                'observations': self.observations,
+                'actions': self.actions,
+                'terminals': self.terminals,
+                **self.extras,
+            },
+        )
+
+    @property
+    def num_rows(self) -> int:
+        """Number of stored rows N."""
+        return len(self.observations)
+
+    @property
+    def num_episodes(self) -> int:
+        """Number of trajectories E."""
+        return len(self.episode_ends)
+
+    @property
+    def num_transitions(self) -> int:
+        """Number of rows that have a successor, N - E."""
+        return self.num_rows - self.num_episodes
+
+    @property
+    def obs_dim(self) -> int:
+        """Width of an observation."""
+        return self.observations.shape[1]
+
+    @property
+    def act_dim(self) -> int:
+        """Width of an action."""
+        return self.actions.shape[1]
+
+    def episode_of(self, rows: np.ndarray) -> np.ndarray:
+        """The trajectory number of each row, int64 of the same shape."""
+        return np.searchsorted(self.episode_ends, rows, side='left')
+
+    def transition_rows(self, numbers: np.ndarray) -> np.ndarray:
+        """Rows of the transitions with the given running numbers in [0, num_transitions)."""
+        episodes = np.searchsorted(self._transition_offsets, numbers, side='right') - 1
+        return numbers + episodes
+
+    def sample_transitions(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        """Rows drawn uniformly among those that have a successor, (count,) int64.
+
+        Raises:
+            DatasetError: If every trajectory is a single state.
+        """
+        if self.num_transitions == 0:
+            raise DatasetError(
+                f'{self.source or "dataset"}: no transitions, every trajectory is a single state'
+            )
+        return self.transition_rows(rng.integers(self.num_transitions, size=count))
+
+    def __repr__(self) -> str:
+        """Sizes at a glance."""
+        return (
+            f'TrajectoryDataset({self.num_episodes} trajectories, {self.num_rows} rows, '
+            f'obs_dim={self.obs_dim}, act_dim={self.act_dim})'
+        )
+
+
+def _matrix(values: np.ndarray, name: str, where: str) -> np.ndarray:
+    array = np.asanyarray(values)
+    if array.dtype.kind not in 'fiu':
+        raise DatasetError(f'{where}: {name} must hold real numbers, got dtype {array.dtype}')
+    if array.ndim != 2 or array.shape[1] == 0:
+        raise DatasetError(
+            f'{where}: {name} must have shape (rows, dimensions), got {array.shape}'
+        )
+    if array.dtype == np.float32:
+        return array
+    # Checked before narrowing too: a finite double can become infinite in float32.
+    _check_finite(array, name, where)
+    with np.errstate(over='ignore'):
+        return array.astype(np.float32)
+
+
+def _flags(values: np.ndarray, where: str) -> np.ndarray:
+    array = np.asanyarray(values)
+    if array.ndim != 1:
+        raise DatasetError(f'{where}: terminals must have shape (rows,), got {array.shape}')
+    if array.dtype == np.bool_:
+        return array
+    if array.dtype.kind not in 'fiu':
+        raise DatasetError(
+            f'{where}: terminals must hold booleans or 0 and 1, got dtype {array.dtype}'
+        )
+    wrong = np.flatnonzero((array != 0) & (array != 1))
+    if len(wrong):
+        raise DatasetError(
+            f'{where}: terminals must hold 0 or 1, got {array[wrong[0]]} in row {wrong[0]}'
+        )
+    return array.astype(bool)
+
+
+def _check_finite(array: np.ndarray, name: str, where: str) -> None:
+    if array.dtype.kind != 'f':
+        return
+    for start in range(0, len(array), _CHUNK_ROWS):
+        finite = np.isfinite(array[start : start + _CHUNK_ROWS]).reshape(
+            len(array[start : start + _CHUNK_ROWS]), -1
+        )
+        if not finite.all():
+            row = int(np.flatnonzero(~finite.all(axis=1))[0])
+            value = array[start + row].reshape(-1)[~finite[row]][0]
+            raise DatasetError(
+                f'{where}: {name} is {value} in row {start + row}; every value must be finite'
+            )

@@ -1,0 +1,111 @@
+"""Goal relabelling: batches whose goals are states of the dataset (OGBench's distributions)."""
+
+from typing import Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from metagcttt_core.config.settings import Settings
+from metagcttt_core.data.dataset import TrajectoryDataset
+
+Batch = dict[str, np.ndarray]
+
+
+class GoalDistribution(Settings):
+    """Where the goal of a transition comes from; the three probabilities sum to 1."""
+
+    p_curgoal: float = Field(0.0, ge=0, le=1, description='probability of the current state')
+    p_trajgoal: float = Field(
+        1.0, ge=0, le=1, description='probability of a later state of the trajectory'
+    )
+    p_randomgoal: float = Field(
+        0.0, ge=0, le=1, description='probability of a random state of the dataset'
+    )
+    geometric: bool = Field(False, description='later states geometrically near (else uniform)')
+
+    @model_validator(mode='after')
+    def _sum_to_one(self) -> Self:
+        total = self.p_curgoal + self.p_trajgoal + self.p_randomgoal
+        if abs(total - 1) > 1e-6:
+            raise ValueError(
+                f'p_curgoal + p_trajgoal + p_randomgoal must sum to 1, got {total:g} '
+                f'({self.p_curgoal:g} + {self.p_trajgoal:g} + {self.p_randomgoal:g})'
+            )
+        return self
+
+
+class GoalConfig(Settings):
+    """Goal distributions of value and actor, and the reward they define."""
+
+    value: GoalDistribution | None = Field(
+        GoalDistribution(p_curgoal=0.2, p_trajgoal=0.5, p_randomgoal=0.3, geometric=True),
+        description='goals of value and critic; none for an agent without them',
+    )
+    actor: GoalDistribution = GoalDistribution()
+    discount: float = Field(
+        0.99, gt=0, lt=1, description='of geometric goals: P(k) = (1 - discount) discount^(k-1)'
+    )
+    gc_negative: bool = Field(
+        True, description='reward 0 at the goal and -1 elsewhere (else 1 and 0)'
+    )
+
+
+class GoalRelabeller:
+    """Draws transitions and goals for them from a dataset."""
+
+    def __init__(self, dataset: TrajectoryDataset, config: GoalConfig) -> None:
+        """Draw from `dataset` by the distributions of `config`."""
+        self.dataset = dataset
+        self.config = config
+
+    def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:
+        """A batch of uniformly drawn transitions, relabelled; see `relabel` for its keys."""
+        return self.relabel(self.dataset.sample_transitions(batch_size, rng), rng)
+
+    def relabel(self, rows: np.ndarray, rng: np.random.Generator) -> Batch:
+        """The transitions at `rows` with freshly drawn goals.
+
+        Args:
+            rows: (B,) rows that have a successor.
+            rng: Source of the goals; value and actor goals are independent.
+
+        Returns:
+            OGBench's batch, float32: `observations`, `next_observations`, `value_goals`,
+            `actor_goals` (B, obs_dim), `actions` (B, act_dim), `rewards`, `masks` (B,). The
+            reward is 0 and the mask 0 where the value goal is the row itself, else -1 and 1 (with
+            `gc_negative`). Without value goals in the config, only `observations`, `actions` and
+            `actor_goals`.
+        """
+        data = self.dataset
+        batch = {'observations': data.observations[rows], 'actions': data.actions[rows]}
+        if self.config.value is not None:
+            value_rows = self.goal_rows(rows, self.config.value, rng)
+            success = (value_rows == rows).astype(np.float32)
+            batch['next_observations'] = data.observations[rows + 1]
+            batch['value_goals'] = data.observations[value_rows]
+            batch['rewards'] = success - np.float32(self.config.gc_negative)
+            batch['masks'] = 1 - success
+        batch['actor_goals'] = data.observations[self.goal_rows(rows, self.config.actor, rng)]
+        return batch
+
+    def goal_rows(
+        self, rows: np.ndarray, goals: GoalDistribution, rng: np.random.Generator
+    ) -> np.ndarray:
+        """A goal row for each transition, (B,) int64.
+
+        The last row of a trajectory has no successor and is never a goal.
+        """
+        size = len(rows)
+        final = self.dataset.episode_ends[self.dataset.episode_of(rows)] - 1
+        if goals.geometric:
+            later = np.minimum(rows + rng.geometric(1 - self.config.discount, size), final)
+        else:
+            d = rng.random(size)
+            later = np.rint(d * np.minimum(rows + 1, final) + (1 - d) * final).astype(np.int64)
+        if goals.p_curgoal == 1:
+            return rows
+        # The order of the reference: a later state or a random one, then perhaps the row itself
+        # instead.
+        pick_later = rng.random(size) < goals.p_trajgoal / (1 - goals.p_curgoal)
+        chosen = np.where(pick_later, later, self.dataset.sample_transitions(size, rng))
+        return np.where(rng.random(size) < goals.p_curgoal, rows, chosen)

@@ -1,0 +1,162 @@
+"""Episodes of a policy that adapts, in a simulator (OGBench's protocol)."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from metagcttt_core.adaptation import adapt, Adaptation, TTTConfig
+from metagcttt_core.agents.agent import Agent
+from metagcttt_core.data.dataset import TrajectoryDataset
+from metagcttt_core.retrieval.support import SupportSet
+from metagcttt_core.retrieval.trajectory_filter import TrajectoryFilter
+
+
+class Simulator(Protocol):
+    """What an evaluation needs of a simulator."""
+
+    @property
+    def tasks(self) -> Iterable[Any]:
+        """The evaluation tasks, each with a `task_id`."""
+
+    def reset(self, task_id: int | None = None, seed: int | None = None) -> tuple[Any, Any]:
+        """Start an episode; returns the observation and the goal."""
+
+    def step(self, action: np.ndarray) -> Any:
+        """Apply an action; the result has `observation`, `terminated`, `truncated`, `success`."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode.
+
+    Attributes:
+        task_id: The evaluation task.
+        success: Whether the goal was reached within the limit.
+        observations: (T + 1, obs_dim) float64, from the first to the last.
+        actions: (T, act_dim) float32.
+        supports: The filtered dataset of each adaptation.
+        adaptations: Each adaptation, in order.
+    """
+
+    task_id: int
+    success: bool
+    observations: np.ndarray
+    actions: np.ndarray
+    supports: list[SupportSet]
+    adaptations: list[Adaptation]
+
+    @property
+    def steps(self) -> int:
+        """Number of control steps T."""
+        return len(self.actions)
+
+
+def run_episode(
+    agent: Agent,
+    simulator: Simulator,
+    task_id: int,
+    seed: int,
+    *,
+    trajectory_filter: TrajectoryFilter | None = None,
+    ttt: TTTConfig | None = None,
+) -> Episode:
+    """One episode of an evaluation task: filter, adapt, act.
+
+    Args:
+        agent: The base policy.
+        simulator: Where to act.
+        task_id: The evaluation task.
+        seed: Of the simulator's reset and of the adaptation.
+        trajectory_filter: Where support sets come from; needed to adapt.
+        ttt: Test-time training; by default the base policy acts as it is. With `horizon`, the base
+            weights are adapted again to the current state every that many steps.
+    """
+    adapting = ttt is not None and ttt.steps > 0
+    if adapting and trajectory_filter is None:
+        raise ValueError('test-time training needs a dataset or a trajectory filter')
+    observation, goal = simulator.reset(task_id=task_id, seed=seed)
+    observations, actions = [observation], []
+    supports, adaptations = [], []
+    expert = agent
+    finished = False
+    while not finished:
+        step = len(actions)
+        if adapting and (step == 0 or (ttt.horizon and step % ttt.horizon == 0)):
+            supports.append(trajectory_filter.query(observation, goal, agent.value_fn))
+            adaptations.append(
+                adapt(agent, trajectory_filter.dataset, supports[-1], goal, ttt, seed=seed)
+            )
+            expert = adaptations[-1].agent
+        action = expert.act(observation, goal)
+        result = simulator.step(action)
+        observation = result.observation
+        observations.append(observation)
+        actions.append(action)
+        finished = result.terminated or result.truncated
+    return Episode(
+        task_id=task_id,
+        success=bool(result.success),
+        observations=np.array(observations),
+        actions=np.array(actions),
+        supports=supports,
+        adaptations=adaptations,
+    )
+
+
+def evaluate_success(
+    agent: Agent,
+    simulator: Simulator,
+    dataset: TrajectoryDataset | None = None,
+    ttt: TTTConfig | None = None,
+    episodes: int = 50,
+    tasks: Iterable[int] | None = None,
+    seed: int = 0,
+    *,
+    trajectory_filter: TrajectoryFilter | None = None,
+) -> dict[str, Any]:
+    """Success rates by OGBench's protocol: deterministic actions on every evaluation task.
+
+    Args:
+        agent: The base policy.
+        simulator: Where to act.
+        dataset: What to adapt on, filtered with the default settings.
+        ttt: Test-time training; none by default.
+        episodes: Episodes per task.
+        tasks: Task numbers; all by default.
+        seed: Of the whole evaluation; every episode derives its own.
+        trajectory_filter: A filter to use instead of one made from `dataset`.
+
+    Returns:
+        `tasks` (success rate by task number), `mean` (over tasks) and `steps` (mean control steps
+        of the successful episodes by task number, None without any).
+    """
+    if episodes < 1:
+        raise ValueError(f'episodes must be at least 1, got {episodes}')
+    task_ids = [task.task_id for task in simulator.tasks] if tasks is None else list(tasks)
+    if trajectory_filter is None and dataset is not None and ttt is not None and ttt.steps > 0:
+        trajectory_filter = TrajectoryFilter(dataset)
+    rates: dict[int, float] = {}
+    steps: dict[int, float | None] = {}
+    for task_id in task_ids:
+        results = [
+            run_episode(
+                agent,
+                simulator,
+                task_id,
+                episode_seed(seed, task_id, number),
+                trajectory_filter=trajectory_filter,
+                ttt=ttt,
+            )
+            for number in range(episodes)
+        ]
+        rates[task_id] = float(np.mean([episode.success for episode in results]))
+        reached = [episode.steps for episode in results if episode.success]
+        steps[task_id] = float(np.mean(reached)) if reached else None
+    return {'tasks': rates, 'mean': float(np.mean(list(rates.values()))), 'steps': steps}
+
+
+def episode_seed(seed: int, task_id: int, number: int) -> int:
+    """The seed of one episode of an evaluation, below 2**31."""
+    return int(np.random.SeedSequence((seed, task_id, number)).generate_state(1)[0] >> 1)

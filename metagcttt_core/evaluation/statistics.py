@@ -1,0 +1,84 @@
+"""Success statistics and the area under the success curve (paper, appendix E)."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+
+class SuccessStatistics(NamedTuple):
+    """Mean success over seeds with its uncertainty.
+
+    Attributes:
+        mean: Mean success rate.
+        standard_error: Population standard deviation over the square root of the number of seeds.
+        half_width: Half the 95 percent confidence interval, 1.96 standard errors.
+        num_seeds: Number of seeds.
+    """
+
+    mean: float
+    standard_error: float
+    half_width: float
+    num_seeds: int
+
+
+def success_statistics(success_rates: Sequence[float]) -> SuccessStatistics:
+    """Statistics of one success rate per seed.
+
+    Raises:
+        ValueError: For no seeds, or a rate outside [0, 1].
+    """
+    rates = np.asarray(success_rates, dtype=np.float64)
+    if rates.ndim != 1 or not len(rates):
+        raise ValueError(f'need one success rate per seed, got shape {rates.shape}')
+    if not np.all((rates >= 0) & (rates <= 1)):
+        raise ValueError(f'success rates must be in [0, 1], got {rates.tolist()}')
+    error = float(rates.std(ddof=0) / np.sqrt(len(rates)))
+    return SuccessStatistics(float(rates.mean()), error, 1.96 * error, len(rates))
+
+
+def normalized_auc(budgets: Sequence[float], success_rates: Sequence[float]) -> float:
+    """Area under success over test-time training steps, divided by the largest budget.
+
+    Args:
+        budgets: (n,) numbers of steps, strictly ascending from 0 or more, at least two.
+        success_rates: (n,) mean success rate at each budget.
+
+    Raises:
+        ValueError: If the lengths differ or the budgets do not ascend.
+    """
+    x = np.asarray(budgets, dtype=np.float64)
+    y = np.asarray(success_rates, dtype=np.float64)
+    if x.ndim != 1 or x.shape != y.shape or len(x) < 2:
+        raise ValueError(
+            f'need two or more budgets with one rate each, got {x.shape} and {y.shape}'
+        )
+    if x[0] < 0 or np.any(np.diff(x) <= 0):
+        raise ValueError(f'budgets must ascend strictly from 0 or more, got {x.tolist()}')
+    if not np.all((y >= 0) & (y <= 1)):
+        raise ValueError(f'success rates must be in [0, 1], got {y.tolist()}')
+    return float(np.trapezoid(y, x) / x[-1])
+
+
+def adaptation_efficiency(
+    baseline: Mapping[int, float], method: Mapping[int, float], threshold: float = 0.8
+) -> float | None:
+    """How many times fewer steps the method needs to reach a success rate than the baseline.
+
+    Args:
+        baseline: Mean success rate by budget.
+        method: The same for the method.
+        threshold: The success rate to reach.
+
+    Returns:
+        The smallest sufficient budget of the baseline over that of the method; infinite when only
+        the method needs none; None when either never reaches the threshold or neither needs a
+        step.
+    """
+    reached = [
+        min((budget for budget, rate in curve.items() if rate >= threshold), default=None)
+        for curve in (baseline, method)
+    ]
+    if reached[0] is None or reached[1] is None or reached == [0, 0]:
+        return None
+    return float('inf') if reached[1] == 0 else reached[0] / reached[1]

@@ -1,0 +1,59 @@
+"""State-goal tasks sampled from the dataset, with their filtered, split data."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from metagcttt_core.data.dataset import TrajectoryDataset
+from metagcttt_core.retrieval.support import SupportSet
+from metagcttt_core.retrieval.trajectory_filter import TrajectoryFilter, ValueFunction
+
+_MAX_REDRAWS = 10_000
+
+
+@dataclass(frozen=True)
+class MetaTask:
+    """One task of the outer loop.
+
+    Attributes:
+        goal: (obs_dim,) the goal g.
+        train: The split that adapts.
+        test: The split that scores the adapted copy; never empty.
+        redraws: State-goal pairs discarded before this one because the filter found too little.
+    """
+
+    goal: np.ndarray
+    train: SupportSet
+    test: SupportSet
+    redraws: int
+
+
+class TaskSampler:
+    """Draws tasks with s and g uniform over the dataset (paper, Algorithm 1, lines 3 to 6)."""
+
+    def __init__(
+        self, trajectory_filter: TrajectoryFilter, test_fraction: float, max_test: int
+    ) -> None:
+        """Hold out `test_fraction` of each support, up to `max_test` transitions."""
+        self._filter = trajectory_filter
+        self._test_fraction = test_fraction
+        self._max_test = max_test
+
+    def sample(self, rng: np.random.Generator, value_fn: ValueFunction | None = None) -> MetaTask:
+        """One task whose filtered dataset can be split; others are redrawn.
+
+        Raises:
+            ValueError: If no drawn pair of states has usable data between them.
+        """
+        dataset: TrajectoryDataset = self._filter.dataset
+        for redraws in range(_MAX_REDRAWS):
+            state, goal = dataset.observations[rng.integers(dataset.num_rows, size=2)]
+            support = self._filter.query(state, goal, value_fn)
+            support = support.without_rows(dataset.terminals)
+            train, test = support.split(self._test_fraction, self._max_test, rng)
+            if len(test):
+                return MetaTask(goal, train, test, redraws)
+        raise ValueError(
+            f'none of {_MAX_REDRAWS} random state-goal pairs has trajectories between them: '
+            'use a larger epsilon, or a critic-based filter for short trajectories'
+        )

@@ -1,0 +1,52 @@
+"""Settings of the trajectory filter."""
+
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from metagcttt_core.config.settings import Settings
+
+Variant = Literal['paper', 'gcttt', 'random', 'relevance_only', 'score_only']
+
+
+class FilterConfig(Settings):
+    """How `TrajectoryFilter` chooses sub-trajectories for a state and a goal.
+
+    Variants: `paper` (appendix A); `gcttt`, the published implementation of GC-TTT; and three
+    ablations: `random` trajectories, `relevance_only` (near the state, whatever the goal) and
+    `score_only` (good for the goal, wherever the state).
+    """
+
+    variant: Variant = Field('paper', description='selection rule')
+    epsilon: float = Field(1.0, gt=0, description='locality radius, in units of the position')
+    top_percent: float = Field(
+        20.0, gt=0, le=100, description='percent of scored trajectories kept'
+    )
+    top_k: int | None = Field(None, ge=1, description='number kept, instead of a percentage')
+    position_dims: tuple[int, ...] = Field(
+        (0, 1), min_length=1, description='observation coordinates that distances use'
+    )
+    scale: tuple[float, ...] | None = Field(
+        None, description='factor of each position coordinate in a distance; 1 by default'
+    )
+    slack: int = Field(5, ge=0, description='gcttt: steps kept beyond the goal')
+    min_steps: int = Field(
+        10, ge=0, description='gcttt: fewest steps to the state of highest value'
+    )
+    seed: int = Field(0, ge=0, description='of the trajectories drawn by the ablations')
+
+    @model_validator(mode='after')
+    def _check_dims(self) -> Self:
+        if any(dim < 0 for dim in self.position_dims):
+            raise ValueError(f'position_dims must not be negative, got {self.position_dims}')
+        if len(set(self.position_dims)) < len(self.position_dims):
+            raise ValueError(f'position_dims must be distinct, got {self.position_dims}')
+        if self.scale is not None:
+            if len(self.scale) != len(self.position_dims):
+                raise ValueError(
+                    f'scale must have one factor per position dimension '
+                    f'({len(self.position_dims)}), got {len(self.scale)}'
+                )
+            if any(factor <= 0 for factor in self.scale):
+                raise ValueError(f'scale factors must be above 0, got {self.scale}')
+        return self

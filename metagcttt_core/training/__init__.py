@@ -1,0 +1,1 @@
+"""Gradient steps, optimisers, checkpoints and pre-training."""

@@ -1,0 +1,216 @@
+"""Checkpoints: safetensors for the weights, JSON for the rest, never pickle."""
+
+from dataclasses import dataclass, field
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field, ValidationError
+from safetensors import SafetensorError
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from metagcttt_core.agents import AGENTS, make_agent
+from metagcttt_core.agents.agent import Agent
+from metagcttt_core.config.settings import error_lines, Settings
+from metagcttt_core.files import atomic_write
+
+FORMAT_VERSION = 1
+_INDEX = 'checkpoint.json'
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that cannot be used; the message names the file and what is wrong."""
+
+
+@dataclass(frozen=True)
+class TrainingState:
+    """What a run needs besides the weights to go on as if never interrupted.
+
+    Attributes:
+        stage: `pretrain` or `post_train`.
+        step: Steps done.
+        settings: The run's settings, to refuse going on with others.
+        optimizer: The optimiser's state by number of the parameter.
+    """
+
+    stage: str
+    step: int
+    settings: dict[str, Any]
+    optimizer: dict[int, dict[str, Tensor]] = field(default_factory=dict)
+
+
+class _Training(Settings):
+    stage: str
+    step: int = Field(ge=0)
+    settings: dict[str, Any]
+
+
+class _Index(Settings):
+    format: str = 'metagcttt-checkpoint'
+    version: int
+    agent: str
+    obs_dim: int = Field(ge=1)
+    act_dim: int = Field(ge=1)
+    settings: dict[str, Any]
+    metadata: dict[str, Any]
+    weights: str = Field(pattern=r'^weights-[0-9a-f]{16}\.safetensors$')
+    training: _Training | None = None
+
+
+def save_checkpoint(agent: Agent, path: str | Path, training: TrainingState | None = None) -> None:
+    """Write an agent to the folder `path`, atomically.
+
+    The weights go to a file named by their hash, then `checkpoint.json`, which names that file, is
+    replaced. A crash in between leaves the previous checkpoint whole.
+
+    Args:
+        agent: What to save, with its `metadata`.
+        path: The folder; made if missing.
+        training: The state of the run, to be resumed later.
+
+    Raises:
+        OSError: If the folder cannot be written; the previous checkpoint is still there.
+    """
+    folder = Path(path)
+    tensors = {f'agent.{name}': tensor for name, tensor in agent.state_dict().items()}
+    if training is not None:
+        for number, state in training.optimizer.items():
+            tensors |= {f'optimizer.{number}.{name}': tensor for name, tensor in state.items()}
+    content = safetensors.torch.save({name: t.contiguous().cpu() for name, t in tensors.items()})
+    weights = f'weights-{hashlib.sha256(content).hexdigest()[:16]}.safetensors'
+    index = _Index(
+        version=FORMAT_VERSION,
+        agent=agent.name,
+        obs_dim=agent.obs_dim,
+        act_dim=agent.act_dim,
+        settings=agent.settings.model_dump(mode='json'),
+        metadata=agent.metadata,
+        weights=weights,
+        training=training
+        and _Training(stage=training.stage, step=training.step, settings=training.settings),
+    )
+    with atomic_write(folder / weights) as file:
+        file.write(content)
+    with atomic_write(folder / _INDEX) as file:
+        file.write((json.dumps(index.model_dump(mode='json'), indent=2) + '\n').encode())
+    for old in folder.glob('weights-*.safetensors'):
+        if old.name != weights:
+            old.unlink()
+
+
+def load_checkpoint(path: str | Path, *, environment: str | None = None) -> Agent:
+    """The agent saved in the folder `path`.
+
+    Args:
+        path: The folder, or its `checkpoint.json`.
+        environment: Refuse a checkpoint trained for another environment.
+
+    Raises:
+        CheckpointError: If there is none, it is damaged, of another version, or does not fit; the
+            message names what.
+    """
+    folder = _folder(path)
+    index = _read_index(folder)
+    trained_for = index.metadata.get('environment')
+    if environment is not None and trained_for != environment:
+        raise CheckpointError(
+            f'{folder}: trained for environment {trained_for!r}, not for {environment!r}'
+        )
+    tensors = _read_tensors(folder, index)
+    if index.agent not in AGENTS:
+        raise CheckpointError(
+            f'{folder}: unknown agent {index.agent!r}; known: {", ".join(AGENTS)}'
+        )
+    try:
+        agent = make_agent(
+            index.agent, obs_dim=index.obs_dim, act_dim=index.act_dim, **index.settings
+        )
+    except ValidationError as error:
+        raise CheckpointError(f'{folder}: settings: {"; ".join(error_lines(error))}') from error
+    own = agent.state_dict()
+    saved = {name[6:]: tensor for name, tensor in tensors.items() if name.startswith('agent.')}
+    missing, unknown = sorted(own.keys() - saved.keys()), sorted(saved.keys() - own.keys())
+    if missing or unknown:
+        raise CheckpointError(
+            f'{folder}: weights do not fit the settings: missing {missing}, unknown {unknown}'
+        )
+    for name, tensor in own.items():
+        if saved[name].shape != tensor.shape:
+            raise CheckpointError(
+                f'{folder}: weight {name} has shape {tuple(saved[name].shape)}, '
+                f'the settings ask for {tuple(tensor.shape)}'
+            )
+        if not torch.isfinite(saved[name]).all():
+            raise CheckpointError(f'{folder}: weight {name} holds a non-finite value')
+    agent.load_state_dict(saved)
+    agent.metadata = dict(index.metadata)
+    return agent
+
+
+def load_training_state(path: str | Path) -> TrainingState:
+    """The state of the run that wrote the checkpoint in `path`.
+
+    Raises:
+        CheckpointError: If there is no checkpoint or it was saved without a training state.
+    """
+    folder = _folder(path)
+    index = _read_index(folder)
+    if index.training is None:
+        raise CheckpointError(f'{folder}: was saved without a training state, cannot be resumed')
+    optimizer: dict[int, dict[str, Tensor]] = {}
+    for name, tensor in _read_tensors(folder, index).items():
+        if name.startswith('optimizer.'):
+            _, number, key = name.split('.')
+            optimizer.setdefault(int(number), {})[key] = tensor
+    training = index.training
+    return TrainingState(training.stage, training.step, training.settings, optimizer)
+
+
+def has_checkpoint(path: str | Path) -> bool:
+    """Whether the folder `path` holds a checkpoint."""
+    return (Path(path) / _INDEX).is_file()
+
+
+def _folder(path: str | Path) -> Path:
+    path = Path(path)
+    return path.parent if path.name == _INDEX else path
+
+
+def _read_index(folder: Path) -> _Index:
+    file = folder / _INDEX
+    try:
+        values = json.loads(file.read_text(encoding='utf-8'))
+    except FileNotFoundError as error:
+        raise CheckpointError(f'{folder}: no checkpoint there ({_INDEX} is missing)') from error
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise CheckpointError(f'{file}: not valid JSON ({error})') from error
+    if not isinstance(values, dict) or values.get('format') != 'metagcttt-checkpoint':
+        raise CheckpointError(f'{file}: not a checkpoint of this project (format is missing)')
+    if values.get('version') != FORMAT_VERSION:
+        raise CheckpointError(
+            f'{file}: is of format version {values.get("version")!r}; '
+            f'this program reads version {FORMAT_VERSION}'
+        )
+    try:
+        return _Index(**values)
+    except ValidationError as error:
+        raise CheckpointError(f'{file}: {"; ".join(error_lines(error))}') from error
+
+
+def _read_tensors(folder: Path, index: _Index) -> dict[str, Tensor]:
+    file = folder / index.weights
+    try:
+        content = file.read_bytes()
+    except FileNotFoundError as error:
+        raise CheckpointError(f'{file}: is missing') from error
+    if f'weights-{hashlib.sha256(content).hexdigest()[:16]}.safetensors' != file.name:
+        raise CheckpointError(
+            f'{file}: is damaged, its content does not match the hash in its name'
+        )
+    try:
+        return safetensors.torch.load(content)
+    except SafetensorError as error:
+        raise CheckpointError(f'{file}: is not a safetensors file ({error})') from error

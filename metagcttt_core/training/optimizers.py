@@ -1,0 +1,34 @@
+"""The optimisers by name."""
+
+from collections.abc import Iterable
+from functools import partial
+from typing import Any, Literal
+
+import torch
+from torch import nn
+
+OptimizerName = Literal['adam', 'sgd']
+
+# Fused: one kernel over all parameters. Torch's Adam adds eps after bias correction, as optax
+# does.
+_OPTIMIZERS = {'adam': partial(torch.optim.Adam, fused=True), 'sgd': torch.optim.SGD}
+
+
+def make_optimizer(
+    name: OptimizerName,
+    parameters: Iterable[nn.Parameter],
+    lr: float,
+    state: dict[int, dict[str, Any]] | None = None,
+) -> torch.optim.Optimizer:
+    """The named optimiser over `parameters`.
+
+    Args:
+        name: `adam` or `sgd`.
+        parameters: What to train.
+        lr: Learning rate.
+        state: Moments and step count to begin with, by number of the parameter; fresh by default.
+    """
+    optimizer = _OPTIMIZERS[name](parameters, lr=lr)
+    if state is not None:
+        optimizer.load_state_dict({**optimizer.state_dict(), 'state': state})
+    return optimizer

@@ -1,0 +1,59 @@
+"""Offline pre-training: minimise an agent's loss on relabelled batches of the dataset."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+import torch
+
+from metagcttt_core.agents.agent import Agent
+from metagcttt_core.config.settings import Settings
+from metagcttt_core.data.dataset import TrajectoryDataset
+from metagcttt_core.data.relabel import GoalRelabeller
+from metagcttt_core.training.optimizers import make_optimizer
+from metagcttt_core.training.run import TrainingRun
+from metagcttt_core.training.step import gradient_step
+
+
+class PretrainConfig(Settings):
+    """Settings of pre-training (OGBench's defaults)."""
+
+    steps: int = Field(400_000, ge=1, description='gradient steps')
+    lr: float = Field(3e-4, gt=0, description='learning rate of Adam')
+    batch_size: int = Field(1024, ge=1, description='transitions per step')
+
+
+def pretrain(
+    agent: Agent,
+    dataset: TrajectoryDataset,
+    config: PretrainConfig,
+    seed: int = 0,
+    *,
+    run: TrainingRun | None = None,
+    on_step: Callable[[int, dict[str, torch.Tensor]], Any] = lambda step, losses: None,
+) -> Agent:
+    """Pre-train a copy of `agent`.
+
+    Args:
+        agent: Where to start.
+        dataset: The offline dataset D.
+        config: Steps, learning rate, batch size.
+        seed: Of the batches.
+        run: Checkpoints and resume.
+        on_step: Told the number of steps done and the losses (detached tensors) after each.
+
+    Returns:
+        The trained copy.
+    """
+    agent = agent.clone()
+    run = run or TrainingRun('pretrain', {})
+    relabeller = GoalRelabeller(dataset, agent.settings.goals)
+    parameters = list(agent.trained_parameters())
+    optimizer = make_optimizer('adam', parameters, config.lr)
+    for step in range(run.restore(agent, optimizer), config.steps):
+        batch = relabeller.sample(config.batch_size, np.random.default_rng((seed, step)))
+        loss, parts = gradient_step(agent, optimizer, parameters, agent.tensors(batch))
+        on_step(step + 1, {'loss': loss, **parts})
+        run.step_done(agent, optimizer, step + 1, config.steps)
+    return agent

@@ -1,0 +1,64 @@
+"""Command lines from typed settings: defaults, then a preset, then flags."""
+
+from collections.abc import Sequence
+import sys
+from typing import Annotated, Any, NoReturn, TypeVar
+
+from metagcttt_core.config import error_lines, load_preset, preset_names, Settings
+from pydantic import BaseModel, ValidationError
+import tyro
+
+SettingsT = TypeVar('SettingsT', bound=Settings)
+
+
+class _Preset(BaseModel):
+    preset: Annotated[str | None, tyro.conf.arg(help='')] = None
+
+
+def parse(
+    model: type[SettingsT], description: str, section: str, argv: Sequence[str] | None = None
+) -> SettingsT:
+    """Settings of one tool, read from the command line.
+
+    `--preset NAME_OR_PATH` loads the values under `section` of a preset first; flags override
+    them.
+
+    Args:
+        model: The tool's settings.
+        description: What the tool does, with an example; opens the help page.
+        section: Key of this tool's values in a preset file.
+        argv: Arguments; those of the process by default.
+
+    Returns:
+        The validated settings. A wrong value ends the process with status 2 and a line that names
+        it.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    preset, rest = tyro.cli(_Preset, args=arguments, return_unknown_args=True, add_help=False)
+    try:
+        values = preset_values(preset.preset, section)
+        description += (
+            f'\n\n--preset NAME_OR_PATH starts from a preset: {", ".join(preset_names())}.'
+        )
+        return tyro.cli(model, args=rest, default=model(**values), description=description)
+    except ValidationError as error:
+        fail(*error_lines(error))
+    except ValueError as error:
+        fail(str(error))
+
+
+def preset_values(name: str | None, section: str) -> dict[str, Any]:
+    """What a preset says about one tool; nothing without a preset."""
+    if name is None:
+        return {}
+    values = load_preset(name)
+    if section not in values:
+        raise ValueError(f'preset {name} has no section {section!r}; it has: {", ".join(values)}')
+    return values[section]
+
+
+def fail(*lines: str) -> NoReturn:
+    """End the process with status 2 after printing each line to standard error."""
+    for line in lines:
+        print(f'error: {line}', file=sys.stderr)
+    raise SystemExit(2)
