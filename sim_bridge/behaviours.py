@@ -1,0 +1,133 @@
+"""What the behaviour policy of a dataset is after: OGBench's navigate, stitch and explore."""
+
+from abc import ABC, abstractmethod
+from typing import Literal
+
+import numpy as np
+
+from sim_bridge.maze_map import Cell, MazeMap
+from sim_bridge.ogbench_layouts import NOISE_M
+from sim_bridge.simulator import Array, Simulator
+
+Kind = Literal['navigate', 'stitch', 'explore']
+
+STITCH_CELLS = 4
+EXPLORE_STEPS = 10
+
+
+class Behaviour(ABC):
+    """Chooses start, goals and the direction to walk in, for one episode.
+
+    Source: OGBench, `data_gen_scripts/generate_locomaze.py`.
+
+    Attributes:
+        start_xy: Where the episode starts, (x, y) in metres.
+        goals_reached: How often the robot came to a goal it was after.
+    """
+
+    def __init__(self, maze: MazeMap, rng: np.random.Generator) -> None:
+        """Draw the start: a free cell, and a place near its center."""
+        self.maze = maze
+        self.rng = rng
+        self.start_cell = self.draw(maze.free_cells())
+        self.start_xy = self.near_center(self.start_cell)
+        self.goals_reached = 0
+
+    @abstractmethod
+    def begin(self, simulator: Simulator) -> None:
+        """Set the first goal, if any, in the episode that was just reset."""
+
+    @abstractmethod
+    def direction(self, simulator: Simulator, row: int) -> Array:
+        """Unit vector (x, y) to walk along at this row of the episode."""
+
+    @abstractmethod
+    def at_goal(self, simulator: Simulator) -> None:
+        """Take note that the robot is within the tolerance of the goal that is set."""
+
+    def draw(self, cells: list[Cell]) -> Cell:
+        """Draw one of the cells, each equally likely."""
+        return cells[self.rng.integers(len(cells))]
+
+    def near_center(self, cell: Cell) -> tuple[float, float]:
+        """Draw a point around the center of a cell."""
+        x, y = self.maze.center(*cell)
+        dx, dy = self.rng.uniform(-NOISE_M, NOISE_M, size=2)
+        return x + dx, y + dy
+
+
+class _GoalSeeker(Behaviour):
+    """Walks from cell to cell on the shortest way to a goal."""
+
+    def __init__(self, maze: MazeMap, rng: np.random.Generator) -> None:
+        """Draw start and goal."""
+        super().__init__(maze, rng)
+        self._goal_cell = self._draw_goal()
+
+    def begin(self, simulator: Simulator) -> None:
+        """Set the goal near the center of its cell."""
+        simulator.set_goal(self.near_center(self._goal_cell))
+
+    def direction(self, simulator: Simulator, row: int) -> Array:
+        """Unit vector to the center of the next cell; on arrival, of the goal's cell."""
+        position = simulator.position
+        target = self.maze.center(*self.maze.next_cell(self.maze.cell(*position), self._goal_cell))
+        return _unit(np.subtract(target, position))
+
+    @abstractmethod
+    def _draw_goal(self) -> Cell:
+        """Draw the cell of the next goal."""
+
+
+class Navigate(_GoalSeeker):
+    """One goal after another, drawn from all free cells that are not corridor."""
+
+    def at_goal(self, simulator: Simulator) -> None:
+        """Count the goal and set the next one."""
+        self.goals_reached += 1
+        self._goal_cell = self._draw_goal()
+        self.begin(simulator)
+
+    def _draw_goal(self) -> Cell:
+        return self.draw(self.maze.open_cells())
+
+
+class Stitch(_GoalSeeker):
+    """One goal exactly four cells away (the start's own cell if there is none); it stays there."""
+
+    def at_goal(self, simulator: Simulator) -> None:
+        """Count the goal once."""
+        self.goals_reached = 1
+
+    def _draw_goal(self) -> Cell:
+        return self.draw(
+            self.maze.cells_at_distance(self.start_cell, STITCH_CELLS) or [self.start_cell]
+        )
+
+
+class Explore(Behaviour):
+    """A new random direction every ten steps, and no goal."""
+
+    def begin(self, simulator: Simulator) -> None:
+        """Leave the episode without a goal."""
+
+    def direction(self, simulator: Simulator, row: int) -> Array:
+        """Return the direction of this stretch of ten steps."""
+        if row % EXPLORE_STEPS == 0:
+            self._direction = _unit(self.rng.standard_normal(2))
+        return self._direction
+
+    def at_goal(self, simulator: Simulator) -> None:
+        """Do nothing: there is no goal to be at."""
+
+
+BEHAVIOURS: dict[Kind, type[Behaviour]] = {
+    'navigate': Navigate,
+    'stitch': Stitch,
+    'explore': Explore,
+}
+
+
+def _unit(vector: Array) -> Array:
+    # OGBench's guard against division by zero; it shortens the vector by a millionth part.
+    return vector / (np.linalg.norm(vector) + 1e-6)

@@ -1,0 +1,121 @@
+"""Finished parts of a dataset under way, kept in a folder until the dataset is whole."""
+
+from dataclasses import dataclass
+import json
+from pathlib import Path
+import shutil
+from typing import Any
+import zipfile
+
+import numpy as np
+
+from sim_bridge.episodes import Episode
+from sim_bridge.files import atomic_file, write_json
+from sim_bridge.plan import GenerationPlan
+
+PER_ROW = ('observations', 'actions', 'qpos', 'qvel')
+_SETTINGS = 'settings.json'
+
+
+class GenerationError(ValueError):
+    """A dataset cannot be generated, or not gone on with; the message says what to do."""
+
+
+def refuse_difference(path: Path, stored: dict[str, Any], asked: dict[str, Any]) -> None:
+    """Refuse to mix two settings in one dataset.
+
+    Raises:
+        GenerationError: If a setting differs; names the first one, both values and the path.
+    """
+    for key in {**asked, **stored}:
+        was, now = stored.get(key), asked.get(key)
+        if was != now:
+            raise GenerationError(
+                f'{path} was made with {key} {was!r}, now {now!r} is asked for: ask for the same '
+                'again, choose another output, or overwrite it'
+            )
+
+
+@dataclass(frozen=True, order=True)
+class Chunk:
+    """Training or validation episodes from `start` up to but without `stop`."""
+
+    validation: bool
+    start: int
+    stop: int
+
+    @property
+    def file_name(self) -> str:
+        """Name of the file that holds the chunk."""
+        split = 'validation' if self.validation else 'train'
+        return f'{split}-{self.start:06d}-{self.stop:06d}.npz'
+
+
+def plan_chunks(plan: GenerationPlan) -> list[Chunk]:
+    """Cut a dataset into chunks; the same for any number of processes."""
+    return [
+        Chunk(validation, start, min(start + plan.chunk_episodes, total))
+        for validation, total in ((False, plan.episodes), (True, plan.validation_episodes))
+        for start in range(0, total, plan.chunk_episodes)
+    ]
+
+
+class ChunkFolder:
+    """Folder of the chunks finished so far, with the settings they were made by.
+
+    A chunk file is either whole or not there, whenever the process that writes it ends.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Point to a folder, which need not exist."""
+        self.path = path
+
+    def open(self, settings: dict[str, Any]) -> None:
+        """Create the folder, or go on with it if it was made by the same settings.
+
+        Raises:
+            GenerationError: If it was made by other settings; names the first that differs.
+        """
+        file = self.path / _SETTINGS
+        if file.exists():
+            refuse_difference(self.path, json.loads(file.read_text(encoding='utf-8')), settings)
+            return
+        self.path.mkdir(parents=True, exist_ok=True)
+        write_json(file, settings)
+
+    def exists(self) -> bool:
+        """Whether a dataset is under way here."""
+        return (self.path / _SETTINGS).exists()
+
+    def has(self, chunk: Chunk) -> bool:
+        """Whether a chunk is finished."""
+        return (self.path / chunk.file_name).exists()
+
+    def write(self, chunk: Chunk, episodes: list[Episode]) -> None:
+        """Store a finished chunk."""
+        arrays = {
+            name: np.concatenate([getattr(episode, name) for episode in episodes])
+            for name in PER_ROW
+        }
+        goals = np.array([episode.goals_reached for episode in episodes])
+        with atomic_file(self.path / chunk.file_name) as temporary, temporary.open('wb') as file:
+            np.savez(file, allow_pickle=False, goals_reached=goals, **arrays)
+
+    def read(self, chunk: Chunk) -> dict[str, np.ndarray]:
+        """Load a finished chunk.
+
+        Raises:
+            GenerationError: If the file is damaged.
+        """
+        path = self.path / chunk.file_name
+        try:
+            with np.load(path, allow_pickle=False) as arrays:
+                return {name: arrays[name] for name in (*PER_ROW, 'goals_reached')}
+        except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
+            raise GenerationError(
+                f'{path} is damaged ({error}): remove it and go on with resume'
+            ) from error
+
+    def remove(self) -> None:
+        """Delete the folder, if it is there."""
+        shutil.rmtree(self.path, ignore_errors=True)

@@ -1,0 +1,202 @@
+"""Generate an offline dataset: episodes in parallel, in resumable chunks, one file at the end."""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+import json
+from pathlib import Path
+from typing import Any
+
+from metagcttt_core.data import TrajectoryDataset
+import numpy as np
+
+from sim_bridge.chunks import (
+    Chunk,
+    ChunkFolder,
+    GenerationError,
+    PER_ROW,
+    plan_chunks,
+    refuse_difference,
+)
+from sim_bridge.controllers import make_direction_follower
+from sim_bridge.files import write_json
+from sim_bridge.plan import GenerationPlan
+from sim_bridge.registry import describe_environment
+from sim_bridge.workers import record_chunks
+
+FORMAT_VERSION = 1
+PHYSICS_PACKAGES = ('mujoco', 'numpy', 'ogbench')
+
+Progress = Callable[[int, int], None]
+"""Called with the number of episodes done and the number there will be."""
+
+
+@dataclass(frozen=True)
+class OutputPaths:
+    """Where the parts of a dataset go, beside one another."""
+
+    train: Path
+
+    def __post_init__(self) -> None:
+        """Refuse a name that the others cannot be derived from."""
+        if self.train.suffix != '.npz':
+            raise GenerationError(f'the output must end in .npz, got {self.train}')
+
+    @property
+    def validation(self) -> Path:
+        """The validation episodes, by OGBench's naming."""
+        return self.train.with_name(f'{self.train.stem}-val.npz')
+
+    @property
+    def sidecar(self) -> Path:
+        """Settings, versions and statistics; written last, so it marks a whole dataset."""
+        return self.train.with_suffix('.json')
+
+    @property
+    def partial(self) -> Path:
+        """Folder of the finished chunks while the dataset is under way."""
+        return self.train.with_suffix('.partial')
+
+
+@dataclass(frozen=True)
+class DatasetStatistics:
+    """What a dataset holds; numbers are of the training file unless they say otherwise.
+
+    Attributes:
+        rows: Rows of the training file.
+        validation_rows: Rows of the validation file.
+        goals_per_episode: Mean number of goals reached in an episode.
+        coverage: Share of the free cells of the maze that were visited, 0 to 1.
+    """
+
+    rows: int
+    validation_rows: int
+    goals_per_episode: float
+    coverage: float
+
+
+def generate(
+    plan: GenerationPlan,
+    output: Path,
+    processes: int = 1,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> DatasetStatistics:
+    """Generate a dataset in OGBench's format and return what it holds.
+
+    Writes `NAME.npz`, `NAME-val.npz` and, last, `NAME.json` (settings, versions, statistics).
+    The files depend on the plan (and the physics packages) alone, not on `processes`.
+    An interruption loses at most the chunks being recorded; `resume` goes on with the others.
+
+    Args:
+        plan: What to generate.
+        output: Path of `NAME.npz`.
+        processes: Worker processes; 1 records in this process.
+        resume: Go on with what an earlier call for the same plan left; a dataset that is whole
+            is left as it is.
+        overwrite: Discard what an earlier call left.
+        progress: Told how many episodes are done.
+
+    Returns:
+        Statistics of the dataset.
+
+    Raises:
+        GenerationError: If the output exists and neither flag is given, if it was made by other
+            settings than the plan's, or if a worker process died.
+        ControllerError: If the robot needs a controller that is not there.
+    """
+    if processes < 1:
+        raise GenerationError(f'processes must be at least 1, got {processes}')
+    make_direction_follower(describe_environment(plan.environment).spec)
+    paths = OutputPaths(output)
+    folder = ChunkFolder(paths.partial)
+    settings = _settings(plan)
+    if overwrite:
+        folder.remove()
+        paths.sidecar.unlink(missing_ok=True)
+    elif not resume:
+        _refuse_existing(paths)
+    elif paths.sidecar.exists():
+        statistics = _finished(paths.sidecar, settings)
+        folder.remove()
+        return statistics
+    folder.open(settings)
+    chunks = plan_chunks(plan)
+    missing = [chunk for chunk in chunks if not folder.has(chunk)]
+    total = sum(chunk.stop - chunk.start for chunk in chunks)
+    done = total - sum(chunk.stop - chunk.start for chunk in missing)
+    if progress:
+        progress(done, total)
+    for chunk in record_chunks(plan, missing, folder, processes):
+        done += chunk.stop - chunk.start
+        if progress:
+            progress(done, total)
+    statistics = _assemble(plan, chunks, folder, paths)
+    write_json(paths.sidecar, {**settings, 'statistics': asdict(statistics)})
+    folder.remove()
+    return statistics
+
+
+def _settings(plan: GenerationPlan) -> dict[str, Any]:
+    """Everything that decides the content of a dataset."""
+    versions = {f'{package}_version': version(package) for package in PHYSICS_PACKAGES}
+    return {'format_version': FORMAT_VERSION, **plan.model_dump(), **versions}
+
+
+def _refuse_existing(paths: OutputPaths) -> None:
+    if paths.partial.exists():
+        raise GenerationError(
+            f'{paths.partial} holds an unfinished dataset: resume it or overwrite it'
+        )
+    for path in (paths.train, paths.validation, paths.sidecar):
+        if path.exists():
+            raise GenerationError(f'{path} exists: overwrite it or choose another output')
+
+
+def _finished(sidecar: Path, settings: dict[str, Any]) -> DatasetStatistics:
+    """Statistics of a dataset that is whole, after checking that it is the one asked for."""
+    try:
+        stored = json.loads(sidecar.read_text(encoding='utf-8'))
+        statistics = DatasetStatistics(**stored.pop('statistics'))
+    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+        raise GenerationError(
+            f'{sidecar} describes no dataset made here: overwrite it or choose another output'
+        ) from error
+    refuse_difference(sidecar, stored, settings)
+    return statistics
+
+
+def _assemble(
+    plan: GenerationPlan, chunks: list[Chunk], folder: ChunkFolder, paths: OutputPaths
+) -> DatasetStatistics:
+    """Join the chunks into the two files of the dataset."""
+    train = [folder.read(chunk) for chunk in chunks if not chunk.validation]
+    validation = [folder.read(chunk) for chunk in chunks if chunk.validation]
+    validation_set = _join(validation, plan.rows_per_episode)
+    validation_set.save(paths.validation)
+    train_set = _join(train, plan.rows_per_episode)
+    train_set.save(paths.train)
+
+    description = describe_environment(plan.environment)
+    positions = train_set.observations[:, list(description.spec.position_dims)]
+    free = ~description.maze.walls
+    visited = description.maze.count_visits(positions) > 0
+    return DatasetStatistics(
+        rows=train_set.num_rows,
+        validation_rows=validation_set.num_rows,
+        goals_per_episode=float(np.concatenate([part['goals_reached'] for part in train]).mean()),
+        coverage=float((visited & free).sum() / free.sum()),
+    )
+
+
+def _join(parts: list[dict[str, np.ndarray]], rows_per_episode: int) -> TrajectoryDataset:
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in PER_ROW}
+    terminals = np.zeros(len(joined['observations']), dtype=bool)
+    terminals[rows_per_episode - 1 :: rows_per_episode] = True
+    return TrajectoryDataset.from_arrays(
+        joined['observations'],
+        joined['actions'],
+        terminals,
+        extras={'qpos': joined['qpos'], 'qvel': joined['qvel']},
+    )

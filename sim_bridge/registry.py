@@ -1,0 +1,85 @@
+"""Simulators by name."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from difflib import get_close_matches
+
+from sim_bridge import ogbench_mazes
+from sim_bridge.maze_map import MazeMap
+from sim_bridge.simulator import MazeDescription, Simulator
+
+
+@dataclass(frozen=True)
+class Family:
+    """Simulators that one module offers.
+
+    Attributes:
+        names: Lists the names of its mazes.
+        canonical_name: Turns any accepted spelling into one of the names, others into None.
+        describe: Spec, plan and tasks of a named maze, without physics.
+        make: Builds the simulator of a named maze.
+    """
+
+    names: Callable[[], tuple[str, ...]]
+    canonical_name: Callable[[str], str | None]
+    describe: Callable[[str], MazeDescription]
+    make: Callable[[str], Simulator]
+
+
+FAMILIES: tuple[Family, ...] = (
+    Family(
+        ogbench_mazes.names,
+        ogbench_mazes.canonical_name,
+        ogbench_mazes.describe,
+        ogbench_mazes.OGBenchMaze,
+    ),
+)
+
+
+def environment_names() -> tuple[str, ...]:
+    """Every name that `make_simulator` takes."""
+    return tuple(name for family in FAMILIES for name in family.names())
+
+
+def make_simulator(name: str) -> Simulator:
+    """Build the simulator of a maze.
+
+    Args:
+        name: One of `environment_names()`, or the name of an OGBench dataset, which stands for
+            the maze it was made in (`pointmaze-medium-navigate-v0` for `pointmaze-medium-v0`).
+
+    Returns:
+        A simulator that waits for `reset`.
+
+    Raises:
+        ValueError: If the name is unknown; names the nearest known one.
+    """
+    family, canonical = _find(name)
+    return family.make(canonical)
+
+
+def describe_environment(name: str) -> MazeDescription:
+    """Spec, plan and tasks of a maze, in microseconds and without loading its physics.
+
+    Raises:
+        ValueError: If the name is unknown.
+    """
+    family, canonical = _find(name)
+    return family.describe(canonical)
+
+
+def maze_map(name: str) -> MazeMap:
+    """Plan of a maze, without loading its physics; see `describe_environment`."""
+    return describe_environment(name).maze
+
+
+def _find(name: str) -> tuple[Family, str]:
+    for family in FAMILIES:
+        canonical = family.canonical_name(name)
+        if canonical is not None:
+            return family, canonical
+    accepted = environment_names()
+    nearest = get_close_matches(name, accepted, n=1, cutoff=0.0)[0]
+    raise ValueError(
+        f'unknown environment {name!r}, did you mean {nearest!r}? accepted: {", ".join(accepted)}'
+    )

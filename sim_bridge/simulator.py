@@ -1,0 +1,196 @@
+"""The interface that every maze simulator implements, and the values it speaks in."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sim_bridge.maze_map import MazeMap
+
+Array = NDArray[np.float64]
+
+
+class SimulatorError(RuntimeError):
+    """A simulator was used in an order or on a machine that it cannot serve."""
+
+
+@dataclass(frozen=True)
+class SimulatorSpec:
+    """What a simulator is, known without running it.
+
+    Attributes:
+        name: Name that `make_simulator` takes.
+        obs_dim: Numbers in an observation.
+        act_dim: Numbers in an action, each within -1 to 1.
+        max_episode_steps: Control steps after which a task episode is truncated.
+        control_period_s: Simulated seconds per control step.
+        goal_tolerance_m: A task is solved within this distance of its goal, in metres.
+        num_tasks: Evaluation tasks, numbered from 1.
+        position_dims: Where x and y, in metres, stand in an observation.
+    """
+
+    name: str
+    obs_dim: int
+    act_dim: int
+    max_episode_steps: int
+    control_period_s: float
+    goal_tolerance_m: float
+    num_tasks: int
+    position_dims: tuple[int, int] = (0, 1)
+
+
+@dataclass(frozen=True)
+class Task:
+    """One evaluation task; start and goal are noisy around these points at every reset.
+
+    Attributes:
+        task_id: Number of the task, from 1.
+        name: Short name, such as `task1`.
+        start_xy: Center of the start cell, (x, y) in metres.
+        goal_xy: Center of the goal cell, (x, y) in metres.
+    """
+
+    task_id: int
+    name: str
+    start_xy: tuple[float, float]
+    goal_xy: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class MazeDescription:
+    """Everything about a maze that needs no physics."""
+
+    spec: SimulatorSpec
+    maze: MazeMap
+    tasks: tuple[Task, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class StepResult:
+    """What one control step led to.
+
+    Attributes:
+        observation: Observation after the step, shape (obs_dim,), float64.
+        terminated: The task's goal is reached; the episode is over.
+        truncated: The step limit of the task episode is reached; the episode is over.
+        success: The position is within the goal tolerance of the goal that is set.
+        clipped: The action lay outside -1 to 1 and was cut to it before use.
+    """
+
+    observation: Array
+    terminated: bool
+    truncated: bool
+    success: bool
+    clipped: bool = False
+
+
+class Simulator(ABC):
+    """One robot in one maze.
+
+    An episode is started by `reset` (a task, which ends by success or by the step limit) or by
+    `reset_free` (no task, which never ends). Everything random comes from the seed given there;
+    without a seed the random streams go on from where they are (they start at seed 0), so a
+    program that resets in the same order sees the same episodes.
+
+    Positions are metres in the frame of the maze, x to the right and y up on its plan.
+    """
+
+    spec: SimulatorSpec
+    maze: MazeMap
+    tasks: tuple[Task, ...]
+
+    @abstractmethod
+    def reset(self, task_id: int | None = None, seed: int | None = None) -> tuple[Array, Array]:
+        """Start an episode of a task and return its first observation and its goal.
+
+        Args:
+            task_id: Task from 1 to `spec.num_tasks`; None draws one.
+            seed: Seed of the start noise, the goal noise and all later randomness.
+
+        Returns:
+            Observation and goal observation, both of shape (obs_dim,), float64.
+
+        Raises:
+            ValueError: If there is no such task or the seed is negative.
+        """
+
+    @abstractmethod
+    def reset_free(
+        self, seed: int | None = None, start_xy: tuple[float, float] | None = None
+    ) -> Array:
+        """Start an episode without a task, which never ends, and return its first observation.
+
+        `step` reports neither `terminated` nor `truncated` in it. There is no goal until
+        `set_goal` gives one; from then on `success` tells whether the robot is at it.
+
+        Args:
+            seed: Seed of the start and of all later randomness.
+            start_xy: Where to put the robot, in metres; None draws a free cell and a place
+                near its center.
+
+        Returns:
+            Observation of shape (obs_dim,), float64.
+
+        Raises:
+            ValueError: If `start_xy` is not in a free cell or the seed is negative.
+        """
+
+    @abstractmethod
+    def step(self, action: ArrayLike) -> StepResult:
+        """Apply an action for one control period.
+
+        Args:
+            action: Shape (act_dim,); values beyond -1 to 1 are cut, as OGBench's evaluation does.
+
+        Raises:
+            ValueError: If the action has another shape or is not finite; nothing moves then.
+            SimulatorError: If no episode is running.
+        """
+
+    @abstractmethod
+    def set_goal(self, goal: ArrayLike) -> None:
+        """Move the goal of the running episode.
+
+        Args:
+            goal: A point (x, y) in metres or an observation of shape (obs_dim,).
+
+        Raises:
+            ValueError: If the goal has another shape, is not finite or is outside the maze.
+            SimulatorError: If no episode is running.
+        """
+
+    @property
+    @abstractmethod
+    def position(self) -> tuple[float, float]:
+        """Where the robot is now, (x, y) in metres."""
+
+    @property
+    @abstractmethod
+    def qpos(self) -> Array:
+        """Generalised positions of the physics, a copy."""
+
+    @property
+    @abstractmethod
+    def qvel(self) -> Array:
+        """Generalised velocities of the physics, a copy."""
+
+    @abstractmethod
+    def render(self) -> NDArray[np.uint8]:
+        """Picture of the maze from above, shape (height, width, 3).
+
+        Raises:
+            SimulatorError: If this machine cannot draw without a display; says what to set.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Free the physics and the renderer; the simulator cannot be used afterwards."""
+
+    def __enter__(self) -> 'Simulator':
+        """Return itself, to be closed at the end of the block."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close."""
+        self.close()

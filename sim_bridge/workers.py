@@ -1,0 +1,87 @@
+"""Record chunks of a dataset, in this process or in several."""
+
+from collections.abc import Iterator
+from concurrent.futures import as_completed, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from functools import cache
+import multiprocessing
+import multiprocessing.connection
+import os
+import signal
+import threading
+
+from sim_bridge.chunks import Chunk, ChunkFolder, GenerationError
+from sim_bridge.controllers import DirectionFollower, make_direction_follower
+from sim_bridge.episodes import episode_generator, record_episode
+from sim_bridge.plan import GenerationPlan
+from sim_bridge.registry import make_simulator
+from sim_bridge.simulator import Simulator
+
+
+def record_chunks(
+    plan: GenerationPlan, chunks: list[Chunk], folder: ChunkFolder, processes: int
+) -> Iterator[Chunk]:
+    """Record chunks into the folder and yield each when it is on disk, in any order.
+
+    Raises:
+        GenerationError: If a worker process died.
+    """
+    if processes == 1 or len(chunks) < 2:
+        for chunk in chunks:
+            yield _record(plan, chunk, folder)
+        return
+    executor = ProcessPoolExecutor(
+        max_workers=min(processes, len(chunks)),
+        mp_context=multiprocessing.get_context('spawn'),
+        initializer=_prepare_worker,
+    )
+    try:
+        futures = [executor.submit(_record, plan, chunk, folder) for chunk in chunks]
+        for future in as_completed(futures):
+            yield future.result()
+    except BrokenProcessPool as error:
+        raise GenerationError(
+            'a worker process died (out of memory?): go on with resume and fewer processes'
+        ) from error
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+def _record(plan: GenerationPlan, chunk: Chunk, folder: ChunkFolder) -> Chunk:
+    simulator, follower = _workbench(plan.environment)
+    episodes = [
+        record_episode(
+            simulator,
+            follower,
+            plan.kind,
+            plan.rows_per_episode,
+            plan.noise,
+            episode_generator(plan.seed, chunk.validation, index),
+        )
+        for index in range(chunk.start, chunk.stop)
+    ]
+    folder.write(chunk, episodes)
+    return chunk
+
+
+@cache
+def _workbench(environment: str) -> tuple[Simulator, DirectionFollower]:
+    """Build simulator and controller once per process."""
+    simulator = make_simulator(environment)
+    return simulator, make_direction_follower(simulator.spec)
+
+
+def _prepare_worker() -> None:
+    """Leave Ctrl-C to the parent, and end when the parent is gone, however it went.
+
+    Without this, workers of a parent that was killed wait for work forever.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_exit_with, args=(parent.sentinel,), daemon=True).start()
+
+
+def _exit_with(sentinel: int) -> None:
+    multiprocessing.connection.wait([sentinel])
+    os._exit(1)
