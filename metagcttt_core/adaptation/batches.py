@@ -32,7 +32,7 @@ class QueryBatches:
         """
         self.rows = rows[~dataset.terminals[rows]]
         self._agent = agent
-        self._relabeller = GoalRelabeller(dataset, agent.settings.goals)
+        self._relabeller = GoalRelabeller(dataset, agent.settings.goals, agent.settings.discount)
         self._goal = np.asarray(goal, dtype=np.float32)
         self._fix_actor_goal = fix_actor_goal
         self._ratio = ratio

@@ -1,16 +1,18 @@
 """Goal-conditioned agents; adding one is a module and a line in `AGENTS`."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
 from metagcttt_core.agents.agent import Agent, AgentSettings, TensorBatch
 from metagcttt_core.agents.gcbc import GCBC
+from metagcttt_core.agents.gciql import GCIQL
 
-AGENTS: dict[str, type[Agent]] = {agent.name: agent for agent in (GCBC,)}
+AgentName = Literal['gcbc', 'gciql']
+AGENTS: dict[str, type[Agent]] = {agent.name: agent for agent in (GCBC, GCIQL)}
 
-__all__ = ['AGENTS', 'GCBC', 'Agent', 'AgentSettings', 'TensorBatch', 'make_agent']
+__all__ = ['AGENTS', 'GCBC', 'GCIQL', 'Agent', 'AgentSettings', 'TensorBatch', 'make_agent']
 
 
 def make_agent(

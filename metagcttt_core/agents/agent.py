@@ -28,6 +28,7 @@ class AgentSettings(Settings):
     const_std: bool = Field(
         True, description='unit standard deviation of the actor (else learned)'
     )
+    discount: float = Field(0.99, gt=0, lt=1, description='of values and of geometric goals')
     goals: GoalConfig = GoalConfig()
 
 

@@ -42,9 +42,6 @@ class GoalConfig(Settings):
         description='goals of value and critic; none for an agent without them',
     )
     actor: GoalDistribution = GoalDistribution()
-    discount: float = Field(
-        0.99, gt=0, lt=1, description='of geometric goals: P(k) = (1 - discount) discount^(k-1)'
-    )
     gc_negative: bool = Field(
         True, description='reward 0 at the goal and -1 elsewhere (else 1 and 0)'
     )
@@ -53,10 +50,16 @@ class GoalConfig(Settings):
 class GoalRelabeller:
     """Draws transitions and goals for them from a dataset."""
 
-    def __init__(self, dataset: TrajectoryDataset, config: GoalConfig) -> None:
-        """Draw from `dataset` by the distributions of `config`."""
+    def __init__(
+        self, dataset: TrajectoryDataset, config: GoalConfig, discount: float = 0.99
+    ) -> None:
+        """Draw from `dataset` by the distributions of `config`.
+
+        `discount` shapes geometric goals: P(k) = (1 - discount) discount^(k-1).
+        """
         self.dataset = dataset
         self.config = config
+        self.discount = discount
 
     def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:
         """A batch of uniformly drawn transitions, relabelled; see `relabel` for its keys."""
@@ -98,7 +101,7 @@ class GoalRelabeller:
         size = len(rows)
         final = self.dataset.episode_ends[self.dataset.episode_of(rows)] - 1
         if goals.geometric:
-            later = np.minimum(rows + rng.geometric(1 - self.config.discount, size), final)
+            later = np.minimum(rows + rng.geometric(1 - self.discount, size), final)
         else:
             d = rng.random(size)
             later = np.rint(d * np.minimum(rows + 1, final) + (1 - d) * final).astype(np.int64)

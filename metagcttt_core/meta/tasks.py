@@ -19,12 +19,14 @@ class MetaTask:
         goal: (obs_dim,) the goal g.
         train: The split that adapts.
         test: The split that scores the adapted copy; never empty.
+        num_transitions: Size of the filtered dataset.
         redraws: State-goal pairs discarded before this one because the filter found too little.
     """
 
     goal: np.ndarray
     train: SupportSet
     test: SupportSet
+    num_transitions: int
     redraws: int
 
 
@@ -52,7 +54,7 @@ class TaskSampler:
             support = support.without_rows(dataset.terminals)
             train, test = support.split(self._test_fraction, self._max_test, rng)
             if len(test):
-                return MetaTask(goal, train, test, redraws)
+                return MetaTask(goal, train, test, len(support), redraws)
         raise ValueError(
             f'none of {_MAX_REDRAWS} random state-goal pairs has trajectories between them: '
             'use a larger epsilon, or a critic-based filter for short trajectories'

@@ -48,7 +48,7 @@ def pretrain(
     """
     agent = agent.clone()
     run = run or TrainingRun('pretrain', {})
-    relabeller = GoalRelabeller(dataset, agent.settings.goals)
+    relabeller = GoalRelabeller(dataset, agent.settings.goals, agent.settings.discount)
     parameters = list(agent.trained_parameters())
     optimizer = make_optimizer('adam', parameters, config.lr)
     for step in range(run.restore(agent, optimizer), config.steps):

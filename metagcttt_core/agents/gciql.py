@@ -1,0 +1,136 @@
+"""Goal-conditioned implicit Q-learning (paper, section 3.1, equations 3 and 4)."""
+
+from collections.abc import Callable
+from typing import ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+import torch
+from torch import nn, Tensor
+from torch.func import functional_call
+
+from metagcttt_core.agents.agent import Agent, AgentSettings, TensorBatch
+from metagcttt_core.agents.networks import MLP
+
+
+class GCIQLSettings(AgentSettings):
+    """Settings of GCIQL."""
+
+    actor_loss: Literal['ddpgbc', 'awr', 'bc'] = Field('ddpgbc', description='policy extraction')
+    alpha: float = Field(
+        0.3, ge=0, description='ddpgbc: weight of cloning; awr: inverse temperature of advantages'
+    )
+    expectile: float = Field(0.9, gt=0, lt=1, description='of the value regression')
+    tau: float = Field(0.005, gt=0, le=1, description='rate of the target critics')
+
+
+class GCIQL(Agent):
+    """Expectile value V(s, g), twin critics Q(s, g, a) with targets, and an extracted actor."""
+
+    name: ClassVar[str] = 'gciql'
+    settings_type: ClassVar[type[AgentSettings]] = GCIQLSettings
+    settings: GCIQLSettings
+
+    def __init__(
+        self, obs_dim: int, act_dim: int, settings: GCIQLSettings, generator: torch.Generator
+    ) -> None:
+        """Build actor, value, two critics and their targets, which start as copies."""
+        super().__init__(obs_dim, act_dim, settings, generator)
+
+        def network(in_dim: int) -> MLP:
+            return MLP(in_dim, settings.hidden, 1, layer_norm=True, generator=generator)
+
+        self.value = network(2 * obs_dim)
+        self.critic1 = network(2 * obs_dim + act_dim)
+        self.critic2 = network(2 * obs_dim + act_dim)
+        self.target1 = network(2 * obs_dim + act_dim).requires_grad_(False)
+        self.target2 = network(2 * obs_dim + act_dim).requires_grad_(False)
+        self.target1.load_state_dict(self.critic1.state_dict())
+        self.target2.load_state_dict(self.critic2.state_dict())
+
+    def losses(
+        self, batch: TensorBatch, *, actor_only: bool = False
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The sum of the value, critic and actor losses, and its parts."""
+        actor, parts = self._actor_loss(batch)
+        if actor_only:
+            return actor, parts
+        value, critic = self._value_loss(batch), self._critic_loss(batch)
+        parts |= {'value': value.detach(), 'critic': critic.detach()}
+        return value + critic + actor, parts
+
+    def _value_loss(self, batch: TensorBatch) -> Tensor:
+        """Expectile regression of V towards the smaller target critic."""
+        inputs = _join(batch['observations'], batch['value_goals'], batch['actions'])
+        with torch.no_grad():
+            q = torch.minimum(self.target1(inputs), self.target2(inputs))
+        error = q - self.value(_join(batch['observations'], batch['value_goals']))
+        expectile = self.settings.expectile
+        weight = torch.where(error >= 0, expectile, 1 - expectile)
+        return (weight * error.square()).mean()
+
+    def _critic_loss(self, batch: TensorBatch) -> Tensor:
+        """Regression of both critics towards r + discount mask V(s', g)."""
+        with torch.no_grad():
+            next_v = self.value(_join(batch['next_observations'], batch['value_goals']))
+            discount = self.settings.discount * batch['masks']
+            target = batch['rewards'] + discount * next_v.squeeze(-1)
+        inputs = _join(batch['observations'], batch['value_goals'], batch['actions'])
+        errors = [critic(inputs).squeeze(-1) - target for critic in (self.critic1, self.critic2)]
+        return sum(error.square().mean() for error in errors)
+
+    def _actor_loss(self, batch: TensorBatch) -> tuple[Tensor, dict[str, Tensor]]:
+        observations, goals = batch['observations'], batch['actor_goals']
+        log_prob, mean = self.log_prob(observations, goals, batch['actions'])
+        kind, alpha = self.settings.actor_loss, self.settings.alpha
+        bc = -log_prob.mean()
+        parts = {'bc': bc.detach()}
+        if kind == 'bc':
+            loss = bc
+        elif kind == 'ddpgbc':
+            q = self._frozen_q(_join(observations, goals, mean.clamp(-1, 1)))
+            q_term = -q.mean() / (q.abs().mean().detach() + 1e-6)
+            parts['q'] = q_term.detach()
+            loss = q_term + alpha * bc
+        else:
+            with torch.no_grad():
+                advantage = self._frozen_q(_join(observations, goals, batch['actions']))
+                advantage -= self.value(_join(observations, goals)).squeeze(-1)
+                weight = torch.exp(alpha * advantage).clamp(max=100)
+            parts['advantage'] = advantage.mean()
+            loss = -(weight * log_prob).mean()
+        return loss, parts | {'actor': loss.detach()}
+
+    def _frozen_q(self, inputs: Tensor) -> Tensor:
+        """The smaller critic (B,), differentiable in its inputs but not in its weights."""
+        qs = [
+            functional_call(critic, _detached(critic), (inputs,))
+            for critic in (self.critic1, self.critic2)
+        ]
+        return torch.minimum(*qs).squeeze(-1)
+
+    @torch.no_grad()
+    def update_targets(self) -> None:
+        """Move the target critics by tau towards the critics."""
+        for target, critic in ((self.target1, self.critic1), (self.target2, self.critic2)):
+            for trailing, weight in zip(target.parameters(), critic.parameters(), strict=True):
+                trailing.lerp_(weight, self.settings.tau)
+
+    @property
+    def value_fn(self) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+        """V(observations (n, obs_dim), goal (obs_dim,)) -> (n,) float32."""
+        return self._value_of
+
+    @torch.inference_mode()
+    def _value_of(self, observations: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        states = torch.from_numpy(np.asarray(observations, np.float32)).to(self.device)
+        goals = torch.from_numpy(np.asarray(goal, np.float32)).to(self.device).expand_as(states)
+        return self.value(_join(states, goals)).squeeze(-1).cpu().numpy()
+
+
+def _join(*parts: Tensor) -> Tensor:
+    return torch.cat(parts, dim=-1)
+
+
+def _detached(module: nn.Module) -> dict[str, Tensor]:
+    return {name: weight.detach() for name, weight in module.named_parameters()}

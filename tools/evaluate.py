@@ -1,0 +1,173 @@
+"""Success of policies by test-time training budget, over tasks, episodes and seeds."""
+
+from collections.abc import Iterator
+from concurrent.futures import as_completed, ProcessPoolExecutor
+import json
+import multiprocessing
+from pathlib import Path
+from typing import Any
+
+from metagcttt_core import (
+    CheckpointError,
+    DatasetError,
+    evaluate_success,
+    FilterConfig,
+    load_checkpoint,
+    normalized_auc,
+    success_statistics,
+    TrajectoryDataset,
+    TrajectoryFilter,
+    TTTConfig,
+)
+from metagcttt_core.config import Settings
+from metagcttt_core.files import atomic_write
+import numpy as np
+from pydantic import Field
+from sim_bridge import make_simulator
+from tqdm import tqdm
+
+from tools.cli import fail, parse
+from tools.runs import provenance, use_threads
+
+_DESCRIPTION = """Success of policies by test-time training budget.
+
+Example: python -m tools.evaluate --checkpoints out/pretrain/checkpoint out/meta/checkpoint
+Prints a table with standard errors over seeds and writes OUT as JSON."""
+
+
+class EvaluateSettings(Settings):
+    """Settings of the tool."""
+
+    checkpoints: tuple[Path, ...] = Field(
+        (Path('out/pretrain/checkpoint'),), min_length=1, description='policies to evaluate'
+    )
+    dataset: Path = Field(
+        Path('data/pointmaze-medium-navigate-v0.npz'), description='dataset to adapt on (npz)'
+    )
+    budgets: tuple[int, ...] = Field(
+        (0, 10, 20, 50, 100, 200), min_length=1, description='numbers of gradient steps K'
+    )
+    ttt: TTTConfig = Field(TTTConfig(), description='test-time training (steps come from budgets)')
+    filter: FilterConfig = FilterConfig()
+    episodes: int = Field(10, ge=1, description='episodes per task and seed')
+    seeds: tuple[int, ...] = Field((0, 1, 2), min_length=1, description='evaluation seeds')
+    processes: int = Field(2, ge=1, description='processes to spread the work over')
+    out: Path = Field(Path('out/evaluation.json'), description='file for the results')
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run the tool."""
+    settings = parse(EvaluateSettings, _DESCRIPTION, 'evaluate', argv)
+    try:
+        results = evaluate(settings)
+    except (DatasetError, CheckpointError) as error:
+        fail(str(error))
+    report = {'settings': settings.model_dump(mode='json'), **provenance(), 'results': results}
+    with atomic_write(settings.out) as file:
+        file.write((json.dumps(report, indent=2) + '\n').encode())
+    print(format_table(results))
+    print(f'results: {settings.out}')
+
+
+def evaluate(settings: EvaluateSettings) -> list[dict[str, Any]]:
+    """Success by policy and budget: rates per seed, their mean and error, and the AUC."""
+    environments = [load_checkpoint(path).metadata['environment'] for path in settings.checkpoints]
+    num_tasks = make_simulator(environments[0]).spec.num_tasks
+    jobs = [
+        (str(path), environment, budget, seed, task)
+        for path, environment in zip(settings.checkpoints, environments, strict=True)
+        for budget in settings.budgets
+        for seed in settings.seeds
+        for task in range(1, num_tasks + 1)
+    ]
+    rates = dict(_run_jobs(settings, jobs))
+    results = []
+    for path, environment in zip(settings.checkpoints, environments, strict=True):
+        curve = []
+        for budget in settings.budgets:
+            key = (str(path), environment, budget)
+            tasks = {
+                task: [rates[*key, seed, task] for seed in settings.seeds]
+                for task in range(1, num_tasks + 1)
+            }
+            per_seed = np.mean(list(tasks.values()), axis=0)
+            statistics = success_statistics(per_seed)
+            curve.append(
+                {
+                    'budget': budget,
+                    'success': statistics.mean,
+                    'standard_error': statistics.standard_error,
+                    'per_seed': per_seed.tolist(),
+                    'per_task': {task: float(np.mean(values)) for task, values in tasks.items()},
+                }
+            )
+        successes = [point['success'] for point in curve]
+        auc = normalized_auc(settings.budgets, successes) if len(curve) > 1 else None
+        results.append({'checkpoint': str(path), 'curve': curve, 'auc': auc})
+    return results
+
+
+def format_table(results: list[dict[str, Any]]) -> str:
+    """Success by budget as a Markdown table."""
+    budgets = [point['budget'] for point in results[0]['curve']]
+    lines = [
+        '| policy | ' + ' | '.join(f'K = {budget}' for budget in budgets) + ' | AUC |',
+        '|---' * (len(budgets) + 2) + '|',
+    ]
+    for result in results:
+        cells = [f'{p["success"]:.2f} ± {p["standard_error"]:.2f}' for p in result['curve']]
+        auc = '' if result['auc'] is None else f'{result["auc"]:.3f}'
+        lines.append(f'| {result["checkpoint"]} | ' + ' | '.join(cells) + f' | {auc} |')
+    return '\n'.join(lines)
+
+
+def _run_jobs(
+    settings: EvaluateSettings, jobs: list[tuple[str, str, int, int, int]]
+) -> Iterator[tuple[tuple[str, str, int, int, int], float]]:
+    """Success rate of every job, as they finish; jobs run in separate processes."""
+    pool = ProcessPoolExecutor(
+        settings.processes,
+        mp_context=multiprocessing.get_context('spawn'),
+        initializer=_start_worker,
+        initargs=(settings,),
+    )
+    with pool, tqdm(total=len(jobs), unit='job', desc='evaluate') as bar:
+        futures = {pool.submit(_success_rate, job): job for job in jobs}
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+            bar.update()
+
+
+class _Worker:
+    """What a worker process loads once."""
+
+    settings: EvaluateSettings
+    trajectory_filter: TrajectoryFilter
+
+
+def _start_worker(settings: EvaluateSettings) -> None:
+    use_threads(1)
+    _Worker.settings = settings
+    _Worker.trajectory_filter = TrajectoryFilter(
+        TrajectoryDataset.load(settings.dataset), settings.filter
+    )
+
+
+def _success_rate(job: tuple[str, str, int, int, int]) -> float:
+    path, environment, budget, seed, task = job
+    simulator = make_simulator(environment)
+    result = evaluate_success(
+        load_checkpoint(path, environment=environment),
+        simulator,
+        ttt=_Worker.settings.ttt.model_copy(update={'steps': budget}),
+        episodes=_Worker.settings.episodes,
+        tasks=[task],
+        seed=seed,
+        trajectory_filter=_Worker.trajectory_filter,
+    )
+    simulator.close()
+    return result['mean']
+
+
+if __name__ == '__main__':
+    main()
