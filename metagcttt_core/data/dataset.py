@@ -91,6 +91,8 @@ class TrajectoryDataset:
                 raise DatasetError(
                     f'{where}: {name} has {got} but observations has {rows}; they must match'
                 )
+            if array.dtype.hasobject:
+                raise DatasetError(f'{where}: {name} holds Python objects, which are never stored')
         if not terminals[-1]:
             raise DatasetError(
                 f'{where}: terminals is false on the last row ({rows - 1}); '

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 import os
 from pathlib import Path
 import tempfile
+from tokenize import TokenError
 from typing import IO
 import zipfile
 import zlib
@@ -34,6 +35,9 @@ def read_arrays(
     try:
         with zipfile.ZipFile(path) as archive:
             members = {info.filename.removesuffix('.npy'): info for info in archive.infolist()}
+            for name in members:
+                if Path(name).name != name:  # would be unpacked somewhere else
+                    raise DatasetError(f'{path}: {name!r} is not a plain array name')
             missing = [name for name in required if name not in members]
             if missing:
                 raise DatasetError(
@@ -50,7 +54,12 @@ def read_arrays(
         raise DatasetError(f'{path}: no such file') from error
     except IsADirectoryError as error:
         raise DatasetError(f'{path}: is a folder, expected an npz file') from error
-    except zipfile.BadZipFile as error:
+    except DatasetError:
+        raise
+    except OSError as error:
+        raise DatasetError(f'{path}: cannot be read or unpacked ({error})') from error
+    # What zipfile raises for damaged, encrypted or unknown archives, besides its own error.
+    except (zipfile.BadZipFile, RuntimeError, ValueError) as error:
         raise DatasetError(f'{path}: not a complete npz file ({error})') from error
 
 
@@ -69,7 +78,9 @@ def _read(path: Path, name: str, source: Path | IO[bytes]) -> np.ndarray:
             return np.lib.format.read_array(source, allow_pickle=False)
     except (zipfile.BadZipFile, zlib.error, EOFError) as error:
         raise DatasetError(f'{path}: {name} is truncated or damaged ({error})') from error
-    except ValueError as error:
+    except MemoryError as error:
+        raise DatasetError(f'{path}: {name} does not fit into memory ({error})') from error
+    except (ValueError, OverflowError, TokenError) as error:  # whatever a bad header leads to
         raise DatasetError(
             f'{path}: {name} cannot be read, it is pickled or damaged ({error})'
         ) from error
@@ -84,10 +95,10 @@ def _unpack(path: Path, archive: zipfile.ZipFile, members: Mapping[str, zipfile.
         target = folder / f'{name}.npy'
         if target.exists() and target.stat().st_size == info.file_size:
             continue
-        try:
-            extracted = Path(archive.extract(info, tempfile.mkdtemp(dir=folder)))
-        except (zipfile.BadZipFile, zlib.error, EOFError) as error:
-            raise DatasetError(f'{path}: {name} is truncated or damaged ({error})') from error
-        os.replace(extracted, target)
-        extracted.parent.rmdir()
+        with tempfile.TemporaryDirectory(dir=folder) as scratch:
+            try:
+                extracted = archive.extract(info, scratch)
+            except (zipfile.BadZipFile, zlib.error, EOFError) as error:
+                raise DatasetError(f'{path}: {name} is truncated or damaged ({error})') from error
+            os.replace(extracted, target)
     return folder
