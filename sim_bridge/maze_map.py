@@ -87,15 +87,14 @@ class MazeMap:
         Raises:
             ValueError: If the point lies outside the maze or is not finite.
         """
+        xmin, xmax, ymin, ymax = self.extent
         if not self.contains(x, y):
-            xmin, xmax, ymin, ymax = self.extent
             raise ValueError(
                 f'point ({x}, {y}) lies outside the maze, which spans x {xmin} to {xmax} '
                 f'and y {ymin} to {ymax} metres'
             )
         rows, cols = self.walls.shape
-        i = math.floor((y - self.origin_xy[1]) / self.unit_m + 0.5)
-        j = math.floor((x - self.origin_xy[0]) / self.unit_m + 0.5)
+        i, j = int((y - ymin) / self.unit_m), int((x - xmin) / self.unit_m)
         # Rounding can lift a point just below the upper edge into the next, missing, cell.
         return min(i, rows - 1), min(j, cols - 1)
 
@@ -118,7 +117,8 @@ class MazeMap:
         Raises:
             ValueError: If a point lies outside the maze; names the first.
         """
-        cells = np.floor((points[:, ::-1] - self.origin_xy[::-1]) / self.unit_m + 0.5)
+        xmin, _, ymin, _ = self.extent
+        cells = np.floor((points[:, ::-1] - (ymin, xmin)) / self.unit_m)
         inside = ((cells >= 0) & (cells < self.walls.shape)).all(axis=1)
         if not inside.all():
             self.cell(*points[np.flatnonzero(~inside)[0]].tolist())

@@ -38,7 +38,9 @@ _TELEPORT_REACH_M = 3.5
 
 def names() -> tuple[str, ...]:
     """Names of the mazes, such as `pointmaze-medium-v0`."""
-    return tuple(f'{robot}-{layout}-v0' for robot in ROBOTS for layout in LAYOUTS)
+    return tuple(
+        f'{robot}-{layout}-v0' for robot, facts in ROBOTS.items() for layout in facts.layouts
+    )
 
 
 def canonical_name(name: str) -> str | None:

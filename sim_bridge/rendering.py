@@ -11,9 +11,12 @@ HEADLESS_LIBRARIES = {'egl': 'EGL', 'osmesa': 'OSMesa'}
 def choose_opengl_library() -> None:
     """Set MUJOCO_GL for this process if nobody did and there is no display.
 
-    MuJoCo reads the variable once, when it is first imported, so this must run before that.
-    Without a suitable library nothing is set: the physics works, drawing does not.
+    MuJoCo reads the variable once, when it is first imported, so this must run before that; later
+    it does nothing. Without a suitable library nothing is set: the physics works, drawing does
+    not.
     """
+    if 'mujoco' in sys.modules:
+        return
     has_display = os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')
     if 'MUJOCO_GL' in os.environ or has_display or not sys.platform.startswith('linux'):
         return

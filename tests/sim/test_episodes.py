@@ -1,0 +1,102 @@
+"""Recorded episodes: what the behaviour policy does and what is stored of it."""
+
+import numpy as np
+import pytest
+from sim_bridge import maze_map, Simulator
+from sim_bridge.behaviours import BEHAVIOURS, Kind, Stitch
+from sim_bridge.controllers import PointFollower
+from sim_bridge.episodes import Episode, episode_generator, record_episode
+from sim_bridge.maze_map import Cell, MazeMap
+
+pytestmark = pytest.mark.mujoco
+KINDS: list[Kind] = ['navigate', 'stitch', 'explore']
+
+
+def record(
+    simulator: Simulator, kind: Kind, num_rows: int, noise: float = 0.5, index: int = 0
+) -> Episode:
+    rng = episode_generator(0, validation=False, index=index)
+    return record_episode(simulator, PointFollower(), kind, num_rows, noise, rng)
+
+
+def cells_of(maze: MazeMap, episode: Episode) -> list[Cell]:
+    return [maze.cell(*position) for position in episode.observations.tolist()]
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_episode_has_the_asked_rows_in_ogbenchs_types(built_point: Simulator, kind: Kind) -> None:
+    episode = record(built_point, kind, 40)
+    for name in ('observations', 'actions', 'qpos', 'qvel'):
+        array = getattr(episode, name)
+        assert array.shape == (40, 2)
+        assert array.dtype == np.float32
+    assert np.abs(episode.actions).max() <= 1
+    np.testing.assert_array_equal(episode.observations, episode.qpos)
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_actions_lead_from_each_row_to_the_next(built_point: Simulator, kind: Kind) -> None:
+    episode = record(built_point, kind, 150)
+    built_point.reset_free(start_xy=tuple(episode.observations[0].tolist()))
+    for row in range(149):
+        observation = built_point.step(episode.actions[row]).observation
+        np.testing.assert_allclose(observation, episode.observations[row + 1], atol=1e-3)
+
+
+def test_generators_differ_by_seed_episode_and_split_and_by_nothing_else() -> None:
+    def first(seed: int, validation: bool, index: int) -> int:
+        return int(episode_generator(seed, validation, index).integers(2**62))
+
+    keys = [(seed, split, index) for seed in (0, 1) for split in (False, True) for index in (0, 1)]
+    assert len({first(*key) for key in keys}) == len(keys)
+    assert [first(*key) for key in keys] == [first(*key) for key in keys]
+
+
+def test_navigate_reaches_one_goal_after_another(built_point: Simulator) -> None:
+    assert record(built_point, 'navigate', 1001).goals_reached >= 4
+    assert record(built_point, 'navigate', 2).goals_reached <= 1
+
+
+def test_navigate_draws_goals_outside_corridors_only() -> None:
+    maze = maze_map('pointmaze-medium-v0')
+    drawn = set()
+    for index in range(300):
+        behaviour = BEHAVIOURS['navigate'](maze, episode_generator(0, False, index))
+        assert maze.is_free(*behaviour.start_xy)
+        drawn.add(behaviour._goal_cell)  # type: ignore[attr-defined]
+    assert drawn == set(maze.open_cells())
+
+
+def test_stitch_goes_to_a_cell_four_away_and_stays(built_point: Simulator) -> None:
+    maze = built_point.maze
+    for index in range(5):
+        episode = record(built_point, 'stitch', 201, noise=0.1, index=index)
+        cells = cells_of(maze, episode)
+        assert maze.distances(cells[0])[cells[-1]] == 4
+        assert cells[-50:] == [cells[-1]] * 50
+        assert episode.goals_reached == 1
+
+
+def test_stitch_stays_where_no_cell_is_four_away() -> None:
+    maze = MazeMap.from_rows(('####', '#..#', '####'), unit_m=4.0, origin_xy=(-4.0, -4.0))
+    behaviour = Stitch(maze, episode_generator(0, False, 0))
+    assert behaviour._goal_cell == behaviour.start_cell
+
+
+def test_explore_keeps_a_direction_for_ten_steps(built_point: Simulator) -> None:
+    episode = record(built_point, 'explore', 40, noise=0.0)
+    blocks = episode.actions.reshape(4, 10, 2)
+    assert (blocks == blocks[:, :1]).all()
+    assert len(np.unique(blocks[:, 0], axis=0)) == 4
+    np.testing.assert_allclose(np.linalg.norm(blocks[:, 0], axis=1), 1.0, atol=1e-5)
+    assert episode.goals_reached == 0
+
+
+def test_noise_has_the_asked_deviation(built_point: Simulator) -> None:
+    calm = record(built_point, 'explore', 500, noise=0.0)
+    noisy = record(built_point, 'explore', 500, noise=0.05)
+    # Directions are drawn between the noise, so compare within a block of one direction.
+    assert np.ptp(calm.actions.reshape(50, 10, 2), axis=1).max() == 0
+    inner = np.abs(noisy.actions.reshape(50, 10, 2)).max(axis=(1, 2)) < 0.99  # nothing was cut
+    spread = noisy.actions.reshape(50, 10, 2)[inner].std(axis=1, ddof=1)
+    assert np.sqrt((spread**2).mean()) == pytest.approx(0.05, rel=0.1)
