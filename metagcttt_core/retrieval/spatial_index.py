@@ -32,22 +32,26 @@ class SpatialIndex:
         self._dims = list(position_dims)
         self._scale = np.ones(len(self._dims)) if scale is None else np.asarray(scale, np.float64)
         self._cell_size = cell_size
-        planar = self._planar(observations[:, self._dims[:2]])
-        self._origin = planar.min(axis=0)
-        self._extent = planar.max(axis=0)
-        cells = self._cells(planar)
-        self._stride = int(cells[:, 1].max()) + 1
-        keys = cells[:, 0] * self._stride + cells[:, 1]
+        columns = [observations[:, dim] for dim in self._dims[:2]]
+        planar = [
+            np.float64(factor) * column
+            for factor, column in zip(self._scale, columns, strict=False)
+        ]
+        self._origin = np.array([values.min() for values in planar])
+        self._extent = np.array([values.max() for values in planar])
+        cells = [self._cell(values, axis) for axis, values in enumerate(planar)]
+        self._stride = int(cells[1].max()) + 1 if len(cells) == 2 else 1
+        keys = cells[0] * self._stride + (cells[1] if len(cells) == 2 else 0)
         order = np.argsort(keys, kind='stable')
         self._order = order.astype(np.int32 if len(order) < 2**31 else np.int64)
-        self._sorted_positions = np.ascontiguousarray(observations[:, self._dims[:2]][order])
+        self._columns = [column[order] for column in columns]
         self._keys, starts = np.unique(keys[order], return_index=True)
         self._starts = np.append(starts, len(order))
 
     @property
     def num_bytes(self) -> int:
         """Memory that the index holds."""
-        arrays = (self._order, self._sorted_positions, self._keys, self._starts)
+        arrays = (self._order, *self._columns, self._keys, self._starts)
         return sum(array.nbytes for array in arrays)
 
     def ball(self, point: np.ndarray, radius: float, *, strict: bool = False) -> Neighbours:
@@ -59,49 +63,56 @@ class SpatialIndex:
             strict: Exclude the boundary.
         """
         point = np.asarray(point, np.float64)
-        slots = self._candidates(self._planar(point[None, :2])[0], radius)
-        rows = self._order[slots].astype(np.int64)
-        if len(self._dims) <= 2:
-            positions = self._sorted_positions[slots]
-        else:
+        slices = self._candidates(point, radius)
+        rows = _gather(self._order, slices)
+        distances = self._distances([_gather(c, slices) for c in self._columns], point)
+        if len(self._dims) > 2:
+            rows = rows[
+                distances <= radius * (1 + 1e-9)
+            ]  # no farther in all coordinates than in two
             positions = self._observations[rows][:, self._dims]
-        distances = self.distances(positions, point)
-        near = distances < radius if strict else distances <= radius
+            distances = self._distances(list(positions.T), point)
+        near = np.flatnonzero(distances < radius if strict else distances <= radius)
         rows, distances = rows[near], distances[near]
-        ascending = np.argsort(rows)
-        return Neighbours(rows[ascending], distances[ascending])
+        ascending = np.argsort(rows, kind='stable')
+        return Neighbours(rows[ascending].astype(np.int64), distances[ascending])
 
     def nearest(self, point: np.ndarray) -> int:
         """The row nearest to `point`, the first on ties."""
         point = np.asarray(point, np.float64)
-        planar = self._planar(point[None, :2])[0]
+        planar = (point * self._scale)[:2]
         outside = np.maximum(self._origin - planar, planar - self._extent).max()
         radius = max(self._cell_size, outside)
         while not len((near := self.ball(point, radius)).rows):
             radius *= 2
         return int(near.rows[np.argmin(near.distances)])
 
-    def distances(self, positions: np.ndarray, point: np.ndarray) -> np.ndarray:
-        """Scaled Euclidean distances (n,) of `positions` (n, dims) to `point` (dims,), float64."""
-        difference = (np.asarray(positions, np.float64) - point) * self._scale
-        return np.sqrt(np.square(difference).sum(axis=1))
+    def _distances(self, columns: list[np.ndarray], point: np.ndarray) -> np.ndarray:
+        """Scaled Euclidean distances (n,), float64, of points given by coordinate to `point`."""
+        squared = np.zeros(len(columns[0]))
+        for column, center, factor in zip(columns, point, self._scale, strict=False):
+            squared += np.square((column - center) * factor)
+        return np.sqrt(squared, out=squared)
 
-    def _planar(self, positions: np.ndarray) -> np.ndarray:
-        return np.asarray(positions, np.float64) * self._scale[:2]
+    def _cell(self, values: np.ndarray, axis: int) -> np.ndarray:
+        return np.floor((values - self._origin[axis]) / self._cell_size).astype(np.int64)
 
-    def _cells(self, planar: np.ndarray) -> np.ndarray:
-        cells = np.floor((planar - self._origin) / self._cell_size).astype(np.int64)
-        return cells if cells.shape[1] == 2 else np.pad(cells, ((0, 0), (0, 1)))
-
-    def _candidates(self, planar: np.ndarray, radius: float) -> np.ndarray:
-        """Slots of the sorted order in cells that overlap the ball's bounding square."""
+    def _candidates(self, point: np.ndarray, radius: float) -> list[slice]:
+        """Slices of the sorted rows whose cells overlap the ball's bounding box."""
+        planar = (point * self._scale)[:2]
         margin = radius * (1 + 1e-9) + 1e-9 * (np.abs(planar) + np.abs(self._origin)).max()
         low = np.maximum(planar - margin, self._origin)
         high = np.minimum(planar + margin, self._extent)
         if np.any(low > high):
-            return np.empty(0, np.int64)
-        (first_x, first_y), (last_x, last_y) = self._cells(np.stack([low, high]))
-        columns = np.arange(first_x, last_x + 1) * self._stride
-        begin = self._starts[np.searchsorted(self._keys, columns + first_y, side='left')]
-        end = self._starts[np.searchsorted(self._keys, columns + last_y, side='right')]
-        return np.concatenate([np.arange(b, e) for b, e in zip(begin, end, strict=True)])
+            return []
+        first = [int(self._cell(low[axis], axis)) for axis in range(len(low))]
+        last = [int(self._cell(high[axis], axis)) for axis in range(len(high))]
+        columns = np.arange(first[0], last[0] + 1) * self._stride
+        in_column = (first[1], last[1]) if len(first) == 2 else (0, 0)
+        begin = self._starts[np.searchsorted(self._keys, columns + in_column[0], side='left')]
+        end = self._starts[np.searchsorted(self._keys, columns + in_column[1], side='right')]
+        return [slice(a, b) for a, b in zip(begin, end, strict=True) if a < b]
+
+
+def _gather(values: np.ndarray, slices: list[slice]) -> np.ndarray:
+    return np.concatenate([values[part] for part in slices]) if slices else values[:0]

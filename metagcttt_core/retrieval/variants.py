@@ -129,9 +129,9 @@ def _gcttt_by_steps(task: Task, config: FilterConfig) -> Candidates:
     data = task.dataset
     near_s = task.near_state(strict=True).rows
     near_g = task.near_goal(strict=True).rows
-    near_g = near_g[~np.isin(near_g, data.episode_starts)]  # a first row is never a match of g
+    near_g = near_g[data.episode_starts[data.episode_of(near_g)] != near_g]  # never a first row
     episodes = data.episode_of(near_s)
-    num_relevant = len(np.unique(episodes))
+    num_relevant = np.count_nonzero(np.diff(episodes, prepend=-1))
     if not len(near_g):
         near_s, episodes = near_s[:0], episodes[:0]
     slot = np.searchsorted(near_g, near_s)
@@ -153,8 +153,9 @@ def _gcttt_by_value(task: Task, config: FilterConfig) -> Candidates:
     """Rank by the smallest step distance log(1 + (1 - discount) V) / log(discount)."""
     data = task.dataset
     near_s = task.near_state(strict=True).rows
-    relevant, first_slot = np.unique(data.episode_of(near_s), return_index=True)
-    firsts = near_s[first_slot]
+    near_episodes = data.episode_of(near_s)
+    first_slots = np.flatnonzero(np.diff(near_episodes, prepend=-1))
+    relevant, firsts = near_episodes[first_slots], near_s[first_slots]
     eligible = firsts + config.min_steps <= data.episode_ends[relevant]
     episodes, firsts = relevant[eligible], firsts[eligible]
     rows = _ranges(firsts + config.min_steps, data.episode_ends[episodes] + 1)
