@@ -1,0 +1,164 @@
+"""A program's view of the robot: put it at a task's start, publish a goal, watch what happens."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+import time
+
+from geometry_msgs.msg import PoseStamped
+from metagcttt_interfaces.msg import AdaptationReport, EpisodeEvent, MazeState
+from metagcttt_interfaces.srv import SetTask
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+_RELIABLE = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
+_LATCHED = QoSProfile(
+    depth=10, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
+
+
+class NoAnswerError(RuntimeError):
+    """The graph did not answer in time."""
+
+
+@dataclass
+class GoalOutcome:
+    """What became of one goal.
+
+    Attributes:
+        success: Whether the goal was reached.
+        steps: Control steps from the goal's acceptance to its end.
+        path: (x, y) in metres at each step.
+        goal: (x, y) of the goal in metres.
+        report: The adaptation to this goal.
+    """
+
+    success: bool
+    steps: int
+    path: list[tuple[float, float]]
+    goal: tuple[float, float]
+    report: AdaptationReport
+
+
+@dataclass
+class _Watched:
+    """Messages since the last reset."""
+
+    states: list[MazeState] = field(default_factory=list)
+    events: list[EpisodeEvent] = field(default_factory=list)
+    reports: list[AdaptationReport] = field(default_factory=list)
+
+
+class MazeClient(Node):
+    """Drives the graph by its public names: `set_task`, `goal_pose`, `episode`, `adaptation`."""
+
+    def __init__(self, check_processes: Callable[[], None]) -> None:
+        """Join the graph.
+
+        Args:
+            check_processes: Called while waiting; raises when a node process has died.
+        """
+        super().__init__('maze_client')
+        self._check_processes = check_processes
+        self._seen = _Watched()
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self)
+        self._goal_pose = self.create_publisher(PoseStamped, 'goal_pose', 10)
+        self._set_task = self.create_client(SetTask, 'set_task')
+        self.create_subscription(
+            MazeState, 'state', lambda state: self._seen.states.append(state), _RELIABLE
+        )
+        self.create_subscription(
+            EpisodeEvent, 'episode', lambda event: self._seen.events.append(event), _RELIABLE
+        )
+        self._reports = self.create_subscription(
+            AdaptationReport,
+            'adaptation',
+            lambda report: self._seen.reports.append(report),
+            _LATCHED,
+        )
+
+    def wait(self, condition: Callable[[], bool], what: str, timeout_s: float) -> None:
+        """Take in messages until `condition` holds.
+
+        Raises:
+            NoAnswerError: If it does not hold within `timeout_s`; names `what`.
+        """
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            self._check_processes()
+            if time.monotonic() > deadline:
+                raise NoAnswerError(f'no answer within {timeout_s:g} s: {what}')
+            self._executor.spin_once(timeout_sec=0.1)
+
+    def wait_until_ready(self, timeout_s: float = 30.0) -> None:
+        """Wait for the three nodes."""
+        self.wait(self._set_task.service_is_ready, 'service set_task', timeout_s)
+        for topic, needed in (('goal_pose', 1), ('action', 1), ('goal', 1)):
+            self.wait(
+                lambda topic=topic, needed=needed: self.count_subscribers(topic) >= needed,
+                f'a subscriber of {topic}',
+                timeout_s,
+            )
+        self.wait(
+            lambda: self._goal_pose.get_subscription_count() >= 1, 'the goal node', timeout_s
+        )
+        self.wait(lambda: self.count_publishers('action') >= 1, 'the policy node', timeout_s)
+
+    def drive(self, task_id: int, seed: int, timeout_s: float = 60.0) -> GoalOutcome:
+        """Put the robot at a task's start, publish its goal and watch what becomes of it."""
+        self._seen = _Watched()
+        request = SetTask.Request(task_id=task_id, seed=seed, send_goal=False)
+        future = self._set_task.call_async(request)
+        self.wait(future.done, f'set_task {task_id}', timeout_s)
+        answer = future.result()
+        if not answer.success:
+            raise NoAnswerError(f'set_task {task_id} was refused: {answer.message}')
+        accepted = self._publish_goal(answer, timeout_s)
+        ends = (EpisodeEvent.REACHED, EpisodeEvent.TIMED_OUT)
+        self.wait(lambda: self._event(accepted.query_id, ends) is not None, 'the goal', timeout_s)
+        end = self._event(accepted.query_id, ends)
+        self.wait(
+            lambda: any(report.query_id == accepted.query_id for report in self._seen.reports),
+            'the adaptation report',
+            timeout_s,
+        )
+        states = [state for state in self._seen.states if state.episode_id == answer.episode_id]
+        return GoalOutcome(
+            success=end.kind == EpisodeEvent.REACHED,
+            steps=end.step - accepted.step,
+            path=[(s.position.x, s.position.y) for s in states if s.step <= end.step],
+            goal=(answer.goal_position.x, answer.goal_position.y),
+            report=next(r for r in self._seen.reports if r.query_id == accepted.query_id),
+        )
+
+    def _publish_goal(self, task: SetTask.Response, timeout_s: float) -> EpisodeEvent:
+        """Publish the goal until the goal node accepts it in the new episode."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            pose = PoseStamped()
+            pose.header.frame_id = 'map'
+            pose.header.stamp = self.get_clock().now().to_msg()
+            pose.pose.position = task.goal_position
+            pose.pose.orientation.w = 1.0
+            known = len(self._seen.events)
+            self._goal_pose.publish(pose)
+            answers = partial(self._answers, known)
+            self.wait(lambda answers=answers: bool(answers()), 'goal_pose', timeout_s)
+            event = answers()[0]
+            if event.kind == EpisodeEvent.GOAL_REJECTED:
+                raise NoAnswerError(f'the goal was rejected: {event.reason}')
+            if event.episode_id == task.episode_id:
+                return event
+            # The goal node had not seen the new episode's first state yet.
+            if time.monotonic() > deadline:
+                raise NoAnswerError('the goal node does not see the new episode')
+
+    def _answers(self, known: int) -> list[EpisodeEvent]:
+        kinds = (EpisodeEvent.GOAL_ACCEPTED, EpisodeEvent.GOAL_REJECTED)
+        return [event for event in self._seen.events[known:] if event.kind in kinds]
+
+    def _event(self, query_id: int, kinds: tuple[int, ...]) -> EpisodeEvent | None:
+        found = [e for e in self._seen.events if e.query_id == query_id and e.kind in kinds]
+        return found[0] if found else None
