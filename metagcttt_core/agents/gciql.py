@@ -1,6 +1,7 @@
 """Goal-conditioned implicit Q-learning (paper, section 3.1, equations 3 and 4)."""
 
-from collections.abc import Callable
+from dataclasses import dataclass
+import hashlib
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -117,15 +118,36 @@ class GCIQL(Agent):
                 trailing.lerp_(weight, self.settings.tau)
 
     @property
-    def value_fn(self) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    def value_fn(self) -> 'StateValue':
         """V(observations (n, obs_dim), goal (obs_dim,)) -> (n,) float32."""
-        return self._value_of
+        return StateValue(self, self._value_digest())
+
+    def _value_digest(self) -> bytes:
+        digest = hashlib.blake2b(digest_size=16)
+        for weight in self.value.parameters():
+            digest.update(weight.detach().cpu().numpy())
+        return digest.digest()
+
+
+@dataclass(frozen=True)
+class StateValue:
+    """V of an agent with the weights it has now; equal only while the weights stay the same.
+
+    Attributes:
+        agent: Whose value network to evaluate.
+        digest: Of those weights.
+    """
+
+    agent: GCIQL
+    digest: bytes
 
     @torch.inference_mode()
-    def _value_of(self, observations: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        states = torch.from_numpy(np.asarray(observations, np.float32)).to(self.device)
-        goals = torch.from_numpy(np.asarray(goal, np.float32)).to(self.device).expand_as(states)
-        return self.value(_join(states, goals)).squeeze(-1).cpu().numpy()
+    def __call__(self, observations: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """V(observations (n, obs_dim) | goal (obs_dim,)), (n,) float32."""
+        device = self.agent.device
+        states = torch.from_numpy(np.asarray(observations, np.float32)).to(device)
+        goals = torch.from_numpy(np.asarray(goal, np.float32)).to(device).expand_as(states)
+        return self.agent.value(_join(states, goals)).squeeze(-1).cpu().numpy()
 
 
 def _join(*parts: Tensor) -> Tensor:

@@ -50,3 +50,8 @@ class FilterConfig(Settings):
             if any(factor <= 0 for factor in self.scale):
                 raise ValueError(f'scale factors must be above 0, got {self.scale}')
         return self
+
+    @property
+    def cell_size(self) -> float:
+        """Edge of the spatial index's cells, in scaled units: a query reads 25 or 36 of them."""
+        return self.epsilon / 2

@@ -1,5 +1,6 @@
 """Rows of a dataset by where they are: a sorted grid over one or two coordinates."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -26,17 +27,24 @@ class SpatialIndex:
         position_dims: tuple[int, ...],
         scale: tuple[float, ...] | None,
         cell_size: float,
+        saved: Mapping[str, np.ndarray] | None = None,
     ) -> None:
-        """Sort the rows of `observations` (N, obs_dim) into cells of `cell_size` (scaled)."""
+        """Sort the rows of `observations` (N, obs_dim) into cells of `cell_size` (scaled).
+
+        `saved` is what `arrays` returned for the same data and settings; then nothing is sorted.
+        """
         self._observations = observations
         self._dims = list(position_dims)
         self._scale = np.ones(len(self._dims)) if scale is None else np.asarray(scale, np.float64)
         self._cell_size = cell_size
-        columns = [observations[:, dim] for dim in self._dims[:2]]
-        planar = [
-            np.float64(factor) * column
-            for factor, column in zip(self._scale, columns, strict=False)
-        ]
+        if saved is not None:
+            self._restore(saved)
+        else:
+            self._build()
+
+    def _build(self) -> None:
+        columns = [self._observations[:, dim] for dim in self._dims[:2]]
+        planar = [column * factor for column, factor in zip(columns, self._scale, strict=False)]
         self._origin = np.array([values.min() for values in planar])
         self._extent = np.array([values.max() for values in planar])
         cells = [self._cell(values, axis) for axis, values in enumerate(planar)]
@@ -48,11 +56,29 @@ class SpatialIndex:
         self._keys, starts = np.unique(keys[order], return_index=True)
         self._starts = np.append(starts, len(order))
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Everything the index computed, by name, to be kept in a file."""
+        columns = {f'column{axis}': column for axis, column in enumerate(self._columns)}
+        return {
+            'order': self._order,
+            'keys': self._keys,
+            'starts': self._starts,
+            'origin': self._origin,
+            'extent': self._extent,
+            'stride': np.array(self._stride),
+            **columns,
+        }
+
+    def _restore(self, saved: Mapping[str, np.ndarray]) -> None:
+        self._order, self._keys, self._starts = saved['order'], saved['keys'], saved['starts']
+        self._origin, self._extent = saved['origin'], saved['extent']
+        self._stride = int(saved['stride'])
+        self._columns = [saved[f'column{axis}'] for axis in range(len(self._origin))]
+
     @property
     def num_bytes(self) -> int:
         """Memory that the index holds."""
-        arrays = (self._order, *self._columns, self._keys, self._starts)
-        return sum(array.nbytes for array in arrays)
+        return sum(array.nbytes for array in self.arrays().values())
 
     def ball(self, point: np.ndarray, radius: float, *, strict: bool = False) -> Neighbours:
         """Rows whose distance to `point` is at most `radius` (below it when `strict`).
@@ -67,9 +93,8 @@ class SpatialIndex:
         rows = _gather(self._order, slices)
         distances = self._distances([_gather(c, slices) for c in self._columns], point)
         if len(self._dims) > 2:
-            rows = rows[
-                distances <= radius * (1 + 1e-9)
-            ]  # no farther in all coordinates than in two
+            # In all coordinates a point is at least as far as in two of them.
+            rows = rows[distances <= radius * (1 + 1e-9)]
             positions = self._observations[rows][:, self._dims]
             distances = self._distances(list(positions.T), point)
         near = np.flatnonzero(distances < radius if strict else distances <= radius)

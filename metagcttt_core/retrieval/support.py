@@ -16,7 +16,8 @@ class SupportSet:
         segments: (start, stop) rows of each kept sub-trajectory, stop excluded.
         episodes: (kept,) int64, the trajectory number of each segment.
         scores: (kept,) float64, the optimality score of each segment; higher is better.
-        num_relevant: Trajectories with a state near the task's state.
+        num_relevant: Trajectories with a state near the task's state; all trajectories where the
+            variant does not ask for that.
         num_scored: Relevant trajectories that could be scored, of which the best were kept.
         milliseconds: Time the query took.
     """

@@ -2,18 +2,20 @@
 
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 import time
 
 import numpy as np
 
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.retrieval.config import FilterConfig
+from metagcttt_core.retrieval.index_file import open_index
 from metagcttt_core.retrieval.spatial_index import SpatialIndex
 from metagcttt_core.retrieval.support import SupportSet
+from metagcttt_core.retrieval.value_cache import ValueCache, ValueFunction
 from metagcttt_core.retrieval.variants import Task, VARIANTS
 
-ValueFunction = Callable[[np.ndarray, np.ndarray], np.ndarray]
-_VALUE_BATCH_ROWS = 8192
+__all__ = ['TrajectoryFilter', 'ValueFunction']
 
 
 class TrajectoryFilter:
@@ -23,8 +25,19 @@ class TrajectoryFilter:
     critic only on states of relevant trajectories.
     """
 
-    def __init__(self, dataset: TrajectoryDataset, config: FilterConfig | None = None) -> None:
+    def __init__(
+        self,
+        dataset: TrajectoryDataset,
+        config: FilterConfig | None = None,
+        index_file: Path | None = None,
+    ) -> None:
         """Index `dataset` by its positions.
+
+        Args:
+            dataset: The offline dataset D.
+            config: Selection rule and its settings.
+            index_file: Where to keep the index between runs; made, or made anew when the data have
+                changed. By default it is built in memory.
 
         Raises:
             ValueError: If a position dimension is not one of the dataset's observation dimensions.
@@ -36,12 +49,17 @@ class TrajectoryFilter:
                 f'position_dims {self.config.position_dims} must be below the width of an '
                 f'observation, which is {dataset.obs_dim} in this dataset'
             )
-        self._index = SpatialIndex(
-            dataset.observations,
-            self.config.position_dims,
-            self.config.scale,
-            cell_size=self.config.epsilon / 2,
-        )
+        if index_file is None:
+            dims, scale = self.config.position_dims, self.config.scale
+            self._index = SpatialIndex(dataset.observations, dims, scale, self.config.cell_size)
+        else:
+            self._index = open_index(dataset, self.config, Path(index_file))
+        self._value_cache = ValueCache(dataset)
+
+    @property
+    def index_bytes(self) -> int:
+        """Memory that the spatial index holds."""
+        return self._index.num_bytes
 
     def query(
         self, state: np.ndarray, goal: np.ndarray, value_fn: ValueFunction | None = None
@@ -69,7 +87,9 @@ class TrajectoryFilter:
             dataset=self.dataset,
             near_state=partial(self._index.ball, state[dims], epsilon),
             near_goal=partial(self._index.ball, goal[dims], epsilon),
-            value=None if value_fn is None else partial(self._values, value_fn, goal),
+            value=None
+            if value_fn is None
+            else partial(self._value_cache.values, value_fn, goal.astype(np.float32)),
         )
         found = VARIANTS[self.config.variant](task, self.config)
         starts, stops = found.starts[found.keep], found.stops[found.keep]
@@ -85,6 +105,37 @@ class TrajectoryFilter:
             num_scored=len(found.scores),
             milliseconds=1e3 * (time.perf_counter() - began),
         )
+
+    def query_batch(
+        self,
+        states: np.ndarray,
+        goals: np.ndarray,
+        value_fn: ValueFunction | None = None,
+    ) -> list[SupportSet]:
+        """The support sets of many tasks, (n, obs_dim) states and goals; see `query`."""
+        if np.shape(states) != np.shape(goals) or np.ndim(states) != 2:
+            raise ValueError(
+                f'states and goals must both have shape (n, {self.dataset.obs_dim}), '
+                f'got {np.shape(states)} and {np.shape(goals)}'
+            )
+        return [
+            self.query(state, goal, value_fn) for state, goal in zip(states, goals, strict=True)
+        ]
+
+    def prefetch_values(
+        self,
+        value_fn: ValueFunction,
+        goal: np.ndarray,
+        should_stop: Callable[[], bool] = lambda: False,
+    ) -> bool:
+        """Evaluate V towards `goal` everywhere, so that later queries of that goal are quick.
+
+        Meant for a background thread between two adaptations of an episode.
+
+        Returns:
+            Whether it was finished before `should_stop` returned true.
+        """
+        return self._value_cache.prefetch(value_fn, self._checked('goal', goal), should_stop)
 
     def nearest_row(self, position: np.ndarray) -> int:
         """The row whose position is nearest to `position` (position dims,), the first on ties."""
@@ -104,17 +155,3 @@ class TrajectoryFilter:
         if not np.isfinite(array).all():
             raise ValueError(f'{name} holds a non-finite value: {array}')
         return array
-
-    def _values(self, value_fn: ValueFunction, goal: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """V of each row, float64, evaluated in batches."""
-        values = np.empty(len(rows), np.float64)
-        goal = goal.astype(np.float32)
-        for start in range(0, len(rows), _VALUE_BATCH_ROWS):
-            batch = rows[start : start + _VALUE_BATCH_ROWS]
-            result = np.asarray(value_fn(self.dataset.observations[batch], goal))
-            if result.shape != (len(batch),):
-                raise ValueError(f'value_fn must return shape ({len(batch)},), got {result.shape}')
-            if not np.isfinite(result).all():
-                raise ValueError('value_fn returned a non-finite value')
-            values[start : start + len(batch)] = result
-        return values

@@ -66,7 +66,9 @@ def random(task: Task, config: FilterConfig) -> Candidates:
     episodes = np.arange(data.num_episodes)
     scores = np.random.default_rng(config.seed).random(len(episodes))
     keep = _best(scores, config)
-    return Candidates(0, episodes, data.episode_starts, data.episode_ends, scores, keep)
+    return Candidates(
+        len(episodes), episodes, data.episode_starts, data.episode_ends, scores, keep
+    )
 
 
 def relevance_only(task: Task, config: FilterConfig) -> Candidates:
@@ -89,7 +91,12 @@ def score_only(task: Task, config: FilterConfig) -> Candidates:
     stops = np.minimum(end.rows + 1, data.episode_ends[end.episodes])
     scores = -end.values
     return Candidates(
-        0, end.episodes, data.episode_starts[end.episodes], stops, scores, _best(scores, config)
+        len(episodes),
+        end.episodes,
+        data.episode_starts[end.episodes],
+        stops,
+        scores,
+        _best(scores, config),
     )
 
 
@@ -159,10 +166,9 @@ def _gcttt_by_value(task: Task, config: FilterConfig) -> Candidates:
     eligible = firsts + config.min_steps <= data.episode_ends[relevant]
     episodes, firsts = relevant[eligible], firsts[eligible]
     rows = _ranges(firsts + config.min_steps, data.episode_ends[episodes] + 1)
-    inside = 1 + (1 - _GCTTT_DISCOUNT) * task.value(rows)
-    distances = np.full(len(rows), np.finfo(np.float64).max)
-    np.log(inside, out=distances, where=inside > 0)
-    distances[inside > 0] /= np.log(_GCTTT_DISCOUNT)
+    inside = 1 + (1 - _GCTTT_DISCOUNT) * task.value(rows).astype(np.float64)
+    steps = np.log(np.where(inside > 0, inside, 1)) / np.log(_GCTTT_DISCOUNT)
+    distances = np.where(inside > 0, steps, np.finfo(np.float64).max)  # V below -100: far away
     best = smallest_per_episode(data.episode_of(rows), rows, distances)
     keep = _best(
         -best.values, config.model_copy(update={'top_k': config.top_k or _GCTTT_NUM_SELECTED})

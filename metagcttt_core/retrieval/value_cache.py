@@ -1,0 +1,87 @@
+"""V of dataset rows towards a goal, each evaluated once."""
+
+from collections import OrderedDict
+from collections.abc import Callable
+import threading
+
+import numpy as np
+
+from metagcttt_core.data.dataset import TrajectoryDataset
+
+ValueFunction = Callable[[np.ndarray, np.ndarray], np.ndarray]
+_BATCH_ROWS = 8192
+
+
+class ValueCache:
+    """Remembers V(row | g) for the most recent pairs of value function and goal.
+
+    Holds 4 bytes per dataset row for each pair. Value functions must be pure; two that compare
+    equal share their values.
+    """
+
+    def __init__(self, dataset: TrajectoryDataset, capacity: int = 2) -> None:
+        """Remember the values of `capacity` pairs."""
+        self._dataset = dataset
+        self._capacity = capacity
+        self._values: OrderedDict[tuple[ValueFunction, bytes], np.ndarray] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def values(self, value_fn: ValueFunction, goal: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """V of each row (n,), float32; only rows that are not known yet are evaluated.
+
+        Args:
+            value_fn: (observations (n, obs_dim), goal (obs_dim,)) -> (n,).
+            goal: (obs_dim,) float32.
+            rows: (n,) rows of the dataset.
+
+        Raises:
+            ValueError: If `value_fn` returns another shape or a non-finite value.
+        """
+        known = self._known(value_fn, goal)
+        unknown = rows[np.isnan(known[rows])]
+        for start in range(0, len(unknown), _BATCH_ROWS):
+            self._evaluate(value_fn, goal, known, unknown[start : start + _BATCH_ROWS])
+        return known[rows]
+
+    def prefetch(
+        self,
+        value_fn: ValueFunction,
+        goal: np.ndarray,
+        should_stop: Callable[[], bool] = lambda: False,
+    ) -> bool:
+        """Evaluate V everywhere, so that every later query of this goal finds it known.
+
+        Meant for a background thread; `should_stop` is asked between batches.
+
+        Returns:
+            Whether it was finished.
+        """
+        goal = np.asarray(goal, np.float32)
+        known = self._known(value_fn, goal)
+        unknown = np.flatnonzero(np.isnan(known))
+        for start in range(0, len(unknown), _BATCH_ROWS):
+            if should_stop():
+                return False
+            self._evaluate(value_fn, goal, known, unknown[start : start + _BATCH_ROWS])
+        return True
+
+    def _known(self, value_fn: ValueFunction, goal: np.ndarray) -> np.ndarray:
+        """The remembered values of a pair, NaN where not known; the oldest pair makes room."""
+        key = (value_fn, goal.tobytes())
+        with self._lock:
+            if key not in self._values:
+                self._values[key] = np.full(self._dataset.num_rows, np.nan, np.float32)
+                if len(self._values) > self._capacity:
+                    self._values.popitem(last=False)
+            self._values.move_to_end(key)
+            return self._values[key]
+
+    def _evaluate(
+        self, value_fn: ValueFunction, goal: np.ndarray, known: np.ndarray, rows: np.ndarray
+    ) -> None:
+        result = np.asarray(value_fn(self._dataset.observations[rows], goal))
+        if result.shape != rows.shape:
+            raise ValueError(f'value_fn must return shape {rows.shape}, got {result.shape}')
+        if not np.isfinite(result).all():
+            raise ValueError('value_fn returned a non-finite value')
+        known[rows] = result
