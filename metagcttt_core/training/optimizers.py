@@ -1,6 +1,7 @@
 """The optimisers by name."""
 
 from collections.abc import Iterable
+import copy
 from functools import partial
 from typing import Any, Literal
 
@@ -27,8 +28,15 @@ def make_optimizer(
         parameters: What to train.
         lr: Learning rate.
         state: Moments and step count to begin with, by number of the parameter; fresh by default.
+            Not changed.
     """
+    parameters = list(parameters)
     optimizer = _OPTIMIZERS[name](parameters, lr=lr)
     if state is not None:
-        optimizer.load_state_dict({**optimizer.state_dict(), 'state': state})
+        # Torch keeps the very tensors it is given and steps them in place.
+        optimizer.load_state_dict({**optimizer.state_dict(), 'state': copy.deepcopy(state)})
+    # The fused kernels change weights without counting it, and value functions rely on the count.
+    optimizer.register_step_post_hook(
+        lambda *_: torch.autograd.graph.increment_version(parameters)
+    )
     return optimizer
