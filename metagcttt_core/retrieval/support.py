@@ -1,11 +1,11 @@
 """The support set: what the filter chose for one task, and why."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SupportSet:
     """Transitions of the dataset worth adapting on for one (state, goal) task.
 
@@ -28,7 +28,7 @@ class SupportSet:
     scores: np.ndarray
     num_relevant: int
     num_scored: int
-    milliseconds: float = field(default=0.0, compare=False)
+    milliseconds: float = 0.0
 
     @property
     def num_kept(self) -> int:
@@ -48,6 +48,19 @@ class SupportSet:
     def __len__(self) -> int:
         """Number of transitions M; a support without any is false."""
         return len(self.indices)
+
+    def __eq__(self, other: object) -> bool:
+        """Whether everything but the time it took is the same."""
+        if not isinstance(other, SupportSet):
+            return NotImplemented
+        return (
+            np.array_equal(self.indices, other.indices)
+            and self.segments == other.segments
+            and np.array_equal(self.episodes, other.episodes)
+            and np.array_equal(self.scores, other.scores)
+            and self.num_relevant == other.num_relevant
+            and self.num_scored == other.num_scored
+        )
 
     def without_rows(self, excluded: np.ndarray) -> 'SupportSet':
         """The same support less the rows where `excluded` (N,) is true."""

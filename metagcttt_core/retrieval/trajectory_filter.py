@@ -100,7 +100,7 @@ class TrajectoryFilter:
             ),
             segments=segments,
             episodes=found.episodes[found.keep],
-            scores=found.scores[found.keep],
+            scores=found.scores[found.keep].astype(np.float64),
             num_relevant=found.num_relevant,
             num_scored=len(found.scores),
             milliseconds=1e3 * (time.perf_counter() - began),
