@@ -1,0 +1,86 @@
+"""The grid index against a scan of all rows, at every scale of the data."""
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from metagcttt_core.retrieval.spatial_index import SpatialIndex
+import numpy as np
+import pytest
+
+
+def scan(observations, dims, scale, point, radius, *, strict=False):
+    """Rows within the radius and their distances, by looking at every row."""
+    offsets = (observations[:, list(dims)].astype(np.float64) - point) * (scale or 1.0)
+    distances = np.sqrt((offsets**2).sum(axis=1))
+    rows = np.flatnonzero(distances < radius if strict else distances <= radius)
+    return rows, distances[rows]
+
+
+@settings(max_examples=300)
+@given(
+    seed=st.integers(0, 10_000),
+    dims=st.sampled_from([(0,), (1,), (0, 1), (2, 0), (0, 1, 2), (3, 1, 0, 2)]),
+    spread=st.sampled_from([1e-3, 1.0, 30.0, 1e6]),
+    offset=st.sampled_from([0.0, -1e3, 1e7]),
+    radius=st.sampled_from([0.1, 1.0, 3.0, 50.0]),
+    cell=st.sampled_from([0.05, 0.5, 7.0]),
+    scaled=st.booleans(),
+    strict=st.booleans(),
+)
+def test_ball_equals_a_scan(seed, dims, spread, offset, radius, cell, scaled, strict):
+    rng = np.random.default_rng(seed)
+    observations = (offset + spread * rng.normal(size=(60, 4))).astype(np.float32)
+    scale = tuple(rng.uniform(0.2, 3, size=len(dims))) if scaled else None
+    # Radii and cells grow with the data, so that balls are neither empty nor everything.
+    radius, cell = radius * spread, cell * spread
+    index = SpatialIndex(observations, dims, scale, cell)
+    points = [
+        observations[7, list(dims)].astype(np.float64),
+        observations[:, list(dims)].mean(axis=0) + radius,
+        observations[:, list(dims)].max(axis=0) + 0.7 * radius,
+        observations[:, list(dims)].min(axis=0) - 100 * radius,
+    ]
+    for point in points:
+        rows, distances = index.ball(point, radius, strict=strict)
+        expected_rows, expected = scan(observations, dims, scale, point, radius, strict=strict)
+        assert rows.tolist() == expected_rows.tolist()
+        np.testing.assert_allclose(distances, expected, rtol=1e-12)
+        assert rows.dtype == np.int64
+
+
+@pytest.mark.parametrize('strict', [False, True])
+def test_boundary_belongs_to_the_ball_unless_strict(strict):
+    observations = np.array([[3, 4], [5, 0], [0, -5], [4, 4], [0, 0]], np.float32)
+    index = SpatialIndex(observations, (0, 1), None, 0.5)
+    rows, distances = index.ball(np.zeros(2), 5.0, strict=strict)
+    assert rows.tolist() == ([4] if strict else [0, 1, 2, 4])
+    assert distances.tolist() == ([0] if strict else [5, 5, 5, 0])
+
+
+def test_rows_are_kept_in_order_among_duplicates():
+    observations = np.tile(np.array([[1, 1], [2, 2]], np.float32), (4, 1))
+    index = SpatialIndex(observations, (0, 1), None, 0.5)
+    assert index.ball(np.ones(2), 0.1).rows.tolist() == [0, 2, 4, 6]
+    assert index.nearest(np.array([1.9, 1.9])) == 1
+
+
+def test_one_outlier_far_away_does_not_hide_the_rest():
+    rng = np.random.default_rng(0)
+    observations = rng.uniform(0, 5, size=(200, 2)).astype(np.float32)
+    observations[17] = (-3e9, 2e9)
+    index = SpatialIndex(observations, (0, 1), None, 0.5)
+    for point in rng.uniform(0, 5, size=(20, 2)):
+        expected, _ = scan(observations, (0, 1), None, point, 1.0)
+        assert len(expected)
+        assert index.ball(point, 1.0).rows.tolist() == expected.tolist()
+    assert index.nearest(np.array([-3.1e9, 2e9])) == 17
+
+
+def test_kept_arrays_restore_the_same_index():
+    rng = np.random.default_rng(1)
+    observations = rng.normal(size=(100, 3)).astype(np.float32)
+    built = SpatialIndex(observations, (0, 1, 2), (1.0, 2.0, 0.5), 0.3)
+    restored = SpatialIndex(observations, (0, 1, 2), (1.0, 2.0, 0.5), 0.3, saved=built.arrays())
+    for point in observations[:10].astype(np.float64):
+        ours, theirs = built.ball(point, 1.5), restored.ball(point, 1.5)
+        assert ours.rows.tolist() == theirs.rows.tolist()
+        assert ours.distances.tolist() == theirs.distances.tolist()
