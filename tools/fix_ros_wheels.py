@@ -12,7 +12,9 @@ import re
 import sys
 import sysconfig
 
-NUMPY_INCLUDE = re.compile(r'/opt/python/[^/;"]+/lib/python3\.\d+/site-packages/numpy/_core/include')
+NUMPY_INCLUDE = re.compile(
+    r'/opt/python/[^/;"]+/lib/python3\.\d+/site-packages/numpy/_core/include'
+)
 PYTHON_INCLUDE = re.compile(r'/opt/python/[^/;"]+/include/python3\.\d+')
 
 

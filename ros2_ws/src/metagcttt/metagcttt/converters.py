@@ -1,0 +1,144 @@
+"""Between messages and arrays. Pure functions; no node is needed to use them."""
+
+from array import array
+from collections.abc import Iterable, Sequence
+
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point
+from metagcttt_core import Adaptation, SupportSet
+from metagcttt_interfaces.msg import ActionCommand, AdaptationReport, MazeState
+from nav_msgs.msg import OccupancyGrid
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sim_bridge import MazeMap
+from std_msgs.msg import Header
+
+OCCUPIED = 100
+FREE = 0
+
+
+def to_floats(values: ArrayLike) -> 'array[float]':
+    """Numbers of shape (n,) as what a float64[] field takes fastest."""
+    floats = array('d')
+    floats.frombytes(np.ascontiguousarray(values, dtype=np.float64).tobytes())
+    return floats
+
+
+def to_array(floats: Sequence[float]) -> NDArray[np.float64]:
+    """The values of a float64[] field as a new array, shape (n,)."""
+    return np.array(floats, dtype=np.float64)
+
+
+def vector_fault(name: str, values: NDArray[np.float64], size: int) -> str:
+    """Why `values` is not a vector of `size` finite numbers; empty when it is."""
+    if values.shape != (size,):
+        return f'{name} has {values.size} values, {size} are needed'
+    if not np.isfinite(values).all():
+        return f'{name} is not finite: {values.tolist()}'
+    return ''
+
+
+def to_point(xy: Iterable[float]) -> Point:
+    """A position (x, y) in metres as a point at height 0."""
+    x, y = xy
+    return Point(x=float(x), y=float(y), z=0.0)
+
+
+def to_time(nanoseconds: int) -> Time:
+    """Nanoseconds as a stamp."""
+    seconds, rest = divmod(nanoseconds, 10**9)
+    return Time(sec=seconds, nanosec=rest)
+
+
+def state_message(
+    header: Header,
+    *,
+    episode_id: int,
+    step: int,
+    observation: NDArray[np.float64],
+    position: tuple[float, float],
+    terminated: bool,
+    truncated: bool,
+    success: bool,
+) -> MazeState:
+    """What the simulator publishes after one control step."""
+    return MazeState(
+        header=header,
+        episode_id=episode_id,
+        step=step,
+        observation=to_floats(observation),
+        position=to_point(position),
+        terminated=bool(terminated),
+        truncated=bool(truncated),
+        success=bool(success),
+    )
+
+
+def action_message(
+    stamp: Time, *, episode_id: int, step: int, query_id: int, values: ArrayLike, adapted: bool
+) -> ActionCommand:
+    """The answer of the policy to one state."""
+    return ActionCommand(
+        header=Header(stamp=stamp),
+        episode_id=episode_id,
+        step=step,
+        query_id=query_id,
+        values=to_floats(values),
+        adapted=bool(adapted),
+    )
+
+
+def report_message(
+    stamp: Time,
+    *,
+    query_id: int,
+    episode_id: int,
+    support: SupportSet | None,
+    adaptation: Adaptation | None,
+    reason: str = '',
+) -> AdaptationReport:
+    """What became of one query.
+
+    Args:
+        stamp: Time of the report.
+        query_id: The query.
+        episode_id: Its episode.
+        support: What the filter found; None when it did not run.
+        adaptation: What the inner loop made of it; None when it did not end.
+        reason: Why there is no adaptation; otherwise the adaptation's own reason is taken.
+    """
+    message = AdaptationReport(
+        header=Header(stamp=stamp), query_id=query_id, episode_id=episode_id, reason=reason
+    )
+    if support is not None:
+        message.relevant_trajectories = int(support.num_relevant)
+        message.kept_trajectories = int(support.num_kept)
+        message.transitions = int(support.num_transitions)
+        message.filter_ms = float(support.milliseconds)
+        message.segment_starts = [int(start) for start, _ in support.segments]
+        message.segment_stops = [int(stop) for _, stop in support.segments]
+    if adaptation is not None:
+        message.adapt_ms = 1000.0 * adaptation.seconds
+        message.steps = len(adaptation.train_losses)
+        message.train_losses = to_floats(adaptation.train_losses)
+        message.test_losses = to_floats(adaptation.test_losses)
+        message.best_step = int(adaptation.best_step)
+        message.accepted = bool(adaptation.accepted)
+        message.reason = adaptation.reason
+    return message
+
+
+def occupancy_grid(maze: MazeMap, header: Header) -> OccupancyGrid:
+    """A maze as a map of its cells, whose origin is the lower left corner of cell (0, 0)."""
+    grid = OccupancyGrid(header=header)
+    xmin, _, ymin, _ = maze.extent
+    rows, cols = maze.walls.shape
+    grid.info.map_load_time = header.stamp
+    grid.info.resolution = float(maze.unit_m)
+    grid.info.width = cols
+    grid.info.height = rows
+    grid.info.origin.position = to_point((xmin, ymin))
+    grid.info.origin.orientation.w = 1.0
+    cells = np.where(maze.walls, OCCUPIED, FREE).astype(np.int8)
+    grid.data = array('b', cells.tobytes())
+    return grid

@@ -1,0 +1,27 @@
+"""The executables. What is slow to import waits until signals are handled."""
+
+from metagcttt.running import run, stop_on_signals
+
+
+def goal_node() -> int:
+    """Run the goal node until Ctrl-C or SIGTERM; returns the exit code."""
+    stop = stop_on_signals()
+    from metagcttt.goal_node import GoalNode
+
+    return run(GoalNode, stop)
+
+
+def policy_node() -> int:
+    """Run the policy node until Ctrl-C or SIGTERM; returns the exit code."""
+    stop = stop_on_signals()
+    from metagcttt.policy_node import PolicyNode
+
+    return run(PolicyNode, stop)
+
+
+def sim_bridge_node() -> int:
+    """Run the simulator's bridge until Ctrl-C or SIGTERM; returns the exit code."""
+    stop = stop_on_signals()
+    from metagcttt.sim_bridge_node import SimBridgeNode
+
+    return run(SimBridgeNode, stop)

@@ -1,0 +1,116 @@
+"""How parameters are declared and checked; the tables are in `parameters`."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
+
+Value = bool | int | float | str
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of a node.
+
+    Attributes:
+        name: Its name; carries the unit when that is not obvious.
+        default: Its default; decides the type.
+        description: What it does, with its unit and what special values mean.
+        minimum, maximum: Inclusive range of a number.
+        choices: Accepted strings; any when empty.
+        changes: When a change takes effect. `start`: never after the start, the parameter is
+            read-only; `configure`: at the next configuration, so only an unconfigured node
+            accepts one; `now`: at once, or for a policy's adaptation with the next one.
+    """
+
+    name: str
+    default: Value
+    description: str
+    minimum: float | None = None
+    maximum: float | None = None
+    choices: tuple[str, ...] = ()
+    changes: Literal['start', 'configure', 'now'] = 'start'
+
+    def descriptor(self) -> ParameterDescriptor:
+        """What `ros2 param describe` shows; rclpy enforces the range and read-only."""
+        descriptor = ParameterDescriptor(
+            name=self.name,
+            description=self.description,
+            additional_constraints=self.accepted() if self.choices else '',
+            read_only=self.changes == 'start',
+        )
+        if self.minimum is not None and self.maximum is not None:
+            if isinstance(self.default, int):
+                descriptor.integer_range = [
+                    IntegerRange(from_value=int(self.minimum), to_value=int(self.maximum), step=1)
+                ]
+            else:
+                descriptor.floating_point_range = [
+                    FloatingPointRange(
+                        from_value=float(self.minimum), to_value=float(self.maximum), step=0.0
+                    )
+                ]
+        return descriptor
+
+    def accepted(self) -> str:
+        """The accepted values, in words."""
+        if self.choices:
+            return 'one of ' + ', '.join(self.choices)
+        if self.minimum is not None:
+            return f'{self.minimum:g} to {self.maximum:g}'
+        return {bool: 'true, false', str: 'any text'}[type(self.default)]
+
+    def refusal(self, value: Any) -> str:
+        """Why `value` cannot be taken, beyond what the descriptor says; empty when it can."""
+        if self.choices and value not in self.choices:
+            return f'{self.name} must be {self.accepted()}, got {value!r}'
+        return ''
+
+
+class ParameterSet:
+    """A node's parameters: declares a table and refuses what the table does not allow."""
+
+    def __init__(
+        self, node: Node, table: Iterable[Parameter], is_configured: Callable[[], bool]
+    ) -> None:
+        """Declare `table` on `node`; overrides from the command line are checked as well.
+
+        Args:
+            node: The node.
+            table: Its parameters.
+            is_configured: Whether what is read at configuration is in use now.
+
+        Raises:
+            rclpy.exceptions.InvalidParameterValueException: For an override that is refused.
+        """
+        self._node = node
+        self._table = {parameter.name: parameter for parameter in table}
+        self._is_configured = is_configured
+        # Before the declarations, which it checks too.
+        node.add_on_set_parameters_callback(self._check)
+        for parameter in self._table.values():
+            node.declare_parameter(parameter.name, parameter.default, parameter.descriptor())
+
+    def __getitem__(self, name: str) -> Any:
+        """The current value of a parameter."""
+        return self._node.get_parameter(name).value
+
+    def _check(self, changes: list[RosParameter]) -> SetParametersResult:
+        for change in changes:
+            parameter = self._table.get(change.name)
+            if parameter is None:  # rclpy's own, such as use_sim_time
+                continue
+            reason = parameter.refusal(change.value)
+            if not reason and parameter.changes == 'configure' and self._is_configured():
+                reason = f'{change.name} is read at configuration: clean the node up first'
+            if reason:
+                return SetParametersResult(successful=False, reason=reason)
+        return SetParametersResult(successful=True)

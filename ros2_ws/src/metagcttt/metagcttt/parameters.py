@@ -1,0 +1,178 @@
+"""The parameters of the nodes. The tables in ros2_ws/README.md repeat them; a test compares."""
+
+from metagcttt.parameter_set import Parameter
+
+ENVIRONMENT = Parameter(
+    'environment', 'pointmaze-medium-v0', 'name of the maze, as sim_bridge knows it'
+)
+STEPPING = Parameter(
+    'stepping',
+    'realtime',
+    'realtime: the world goes on by itself; lockstep: it waits for the action of every step. '
+    'The same for all nodes',
+    choices=('realtime', 'lockstep'),
+)
+FRAME_ID = Parameter('frame_id', 'map', 'frame of the maze, of all positions and of all goals')
+DATASET = Parameter('dataset', '', 'dataset file (.npz); empty: the committed one')
+
+GOAL_NODE = (
+    ENVIRONMENT,
+    DATASET,
+    STEPPING,
+    FRAME_ID,
+    Parameter(
+        'goal_tolerance_m',
+        0.0,
+        "a goal is reached within this distance, metres; 0: the environment's own",
+        minimum=0,
+        maximum=1000,
+        changes='now',
+    ),
+    Parameter(
+        'max_steps',
+        0,
+        "control steps that a goal may take; 0: the environment's own limit",
+        minimum=0,
+        maximum=10**6,
+        changes='now',
+    ),
+    Parameter(
+        'seed',
+        0,
+        'seed of the adaptation to goals from goal_pose',
+        minimum=0,
+        maximum=2**63 - 1,
+        changes='now',
+    ),
+)
+
+SIM_BRIDGE_NODE = (
+    ENVIRONMENT,
+    STEPPING,
+    FRAME_ID,
+    Parameter(
+        'speed_factor',
+        1.0,
+        'realtime: simulated seconds per second',
+        minimum=0.01,
+        maximum=1000,
+        changes='now',
+    ),
+    Parameter(
+        'action_timeout_s',
+        0.5,
+        'realtime: an action older than this counts as zero, simulated seconds',
+        minimum=0.01,
+        maximum=3600,
+        changes='now',
+    ),
+    Parameter('publish_clock', True, 'publish the simulated time on /clock'),
+    Parameter('seed', 0, 'seed of the first episode', minimum=0, maximum=2**32 - 1),
+)
+
+POLICY_NODE = (
+    Parameter('autostart', True, 'configure and activate at the start'),
+    Parameter(
+        'checkpoint', '', 'folder of the policy; empty: the committed one', changes='configure'
+    ),
+    Parameter(DATASET.name, DATASET.default, DATASET.description, changes='configure'),
+    Parameter(
+        STEPPING.name,
+        STEPPING.default,
+        STEPPING.description,
+        choices=STEPPING.choices,
+        changes='configure',
+    ),
+    Parameter(
+        'adaptation',
+        'async',
+        'async: act with the weights in hand until the expert is ready; hold: wait for it',
+        choices=('async', 'hold'),
+        changes='now',
+    ),
+    Parameter(
+        'adapt_steps',
+        10,
+        'gradient steps per goal; 0: act with the base policy',
+        minimum=0,
+        maximum=10000,
+        changes='now',
+    ),
+    Parameter(
+        'adapt_lr',
+        3e-4,
+        'learning rate of the adaptation',
+        minimum=1e-8,
+        maximum=1,
+        changes='now',
+    ),
+    Parameter(
+        'adapt_batch_size',
+        1024,
+        'transitions per gradient step',
+        minimum=1,
+        maximum=10**6,
+        changes='now',
+    ),
+    Parameter(
+        'early_stopping',
+        False,
+        'hold out part of the support set and keep the step that does best on it',
+        changes='now',
+    ),
+    Parameter('actor_only', False, 'adapt the actor alone, not the critic', changes='now'),
+    Parameter(
+        'horizon',
+        0,
+        'control steps after which to adapt anew from the base weights; 0: never',
+        minimum=0,
+        maximum=10**6,
+        changes='now',
+    ),
+    Parameter(
+        'epsilon',
+        1.0,
+        'a trajectory is relevant when it passes this close to the agent, metres',
+        minimum=0.001,
+        maximum=1000,
+        changes='configure',
+    ),
+    Parameter(
+        'top_percent',
+        20.0,
+        'share of the relevant trajectories that is kept, percent',
+        minimum=0.001,
+        maximum=100,
+        changes='configure',
+    ),
+    Parameter(
+        'rate_hz',
+        20.0,
+        'realtime: actions per second of the node clock',
+        minimum=0.1,
+        maximum=1000,
+        changes='now',
+    ),
+    Parameter(
+        'state_timeout_s',
+        0.5,
+        'realtime: without a state for this long the action is zero, seconds of the node clock',
+        minimum=0.01,
+        maximum=3600,
+        changes='now',
+    ),
+    Parameter(
+        'threads',
+        0,
+        "threads that PyTorch uses; 0: PyTorch's own choice",
+        minimum=0,
+        maximum=256,
+        changes='configure',
+    ),
+)
+
+TABLES = {
+    'goal_node': GOAL_NODE,
+    'policy_node': POLICY_NODE,
+    'sim_bridge_node': SIM_BRIDGE_NODE,
+}
