@@ -7,7 +7,7 @@ import math
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, PositiveInt
 import torch
 from torch import nn, Tensor
 
@@ -22,7 +22,7 @@ _HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
 class AgentSettings(Settings):
     """Settings that all agents share."""
 
-    hidden: tuple[int, ...] = Field(
+    hidden: tuple[PositiveInt, ...] = Field(
         (512, 512, 512), min_length=1, description='units of each hidden layer'
     )
     const_std: bool = Field(
