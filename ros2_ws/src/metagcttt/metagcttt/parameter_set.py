@@ -65,7 +65,8 @@ class Parameter:
         if self.choices:
             return 'one of ' + ', '.join(self.choices)
         if self.minimum is not None:
-            return f'{self.minimum:g} to {self.maximum:g}'
+            form = 'd' if isinstance(self.default, int) else 'g'
+            return f'{self.minimum:{form}} to {self.maximum:{form}}'
         return {bool: 'true, false', str: 'any text'}[type(self.default)]
 
     def refusal(self, value: Any) -> str:

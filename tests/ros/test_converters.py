@@ -1,0 +1,122 @@
+from metagcttt.converters import (
+    action_message,
+    occupancy_grid,
+    report_message,
+    state_message,
+    to_array,
+    to_floats,
+    to_point,
+    to_time,
+    vector_fault,
+)
+from metagcttt_core import Adaptation, make_agent, SupportSet
+from metagcttt_interfaces.msg import MazeState
+import numpy as np
+import pytest
+from rclpy.serialization import deserialize_message, serialize_message
+from sim_bridge import MazeMap
+from std_msgs.msg import Header
+
+VALUES = np.array([0.1, -1 / 3, 1e-300])
+
+
+def test_floats_survive_the_way_through_a_message_bit_by_bit() -> None:
+    message = MazeState(observation=to_floats(VALUES))
+    received = deserialize_message(serialize_message(message), MazeState)
+    np.testing.assert_array_equal(to_array(received.observation), VALUES)
+
+
+def test_float32_values_are_widened_exactly() -> None:
+    values = VALUES.astype(np.float32)
+    np.testing.assert_array_equal(to_array(to_floats(values)), values.astype(np.float64))
+
+
+def test_received_array_is_a_copy() -> None:
+    floats = to_floats(VALUES)
+    to_array(floats)[0] = 9.0
+    assert floats[0] == VALUES[0]
+
+
+@pytest.mark.parametrize(
+    ('values', 'fault'),
+    [
+        ([1.0, 2.0], ''),
+        ([1.0], 'the state has 1 values, 2 are needed'),
+        ([], 'the state has 0 values, 2 are needed'),
+        ([1.0, np.nan], 'the state is not finite: [1.0, nan]'),
+        ([-np.inf, 0.0], 'the state is not finite: [-inf, 0.0]'),
+    ],
+)
+def test_vector_fault(values: list[float], fault: str) -> None:
+    assert vector_fault('the state', np.array(values, dtype=np.float64), 2) == fault
+
+
+def test_time_splits_nanoseconds() -> None:
+    stamp = to_time(3_000_000_007)
+    assert (stamp.sec, stamp.nanosec) == (3, 7)
+
+
+def test_point_takes_numpy_scalars() -> None:
+    point = to_point(np.float32([1.5, 2.5]))
+    assert (point.x, point.y, point.z) == (1.5, 2.5, 0.0)
+
+
+def test_state_message_takes_numpy_flags() -> None:
+    message = state_message(
+        Header(frame_id='map'),
+        episode_id=2,
+        step=5,
+        observation=VALUES,
+        position=(1.0, 2.0),
+        terminated=np.bool_(True),
+        truncated=np.bool_(False),
+        success=np.bool_(True),
+    )
+    assert (message.terminated, message.truncated, message.success) == (True, False, True)
+    assert (message.episode_id, message.step, message.header.frame_id) == (2, 5, 'map')
+
+
+def test_action_message_names_what_it_answers() -> None:
+    message = action_message(
+        to_time(5), episode_id=2, step=3, query_id=4, values=np.float32([0.5, -1]), adapted=True
+    )
+    assert (message.episode_id, message.step, message.query_id) == (2, 3, 4)
+    assert (list(message.values), message.adapted) == ([0.5, -1.0], True)
+
+
+def test_report_message_tells_support_and_losses() -> None:
+    support = SupportSet(
+        indices=np.array([4, 5, 9]),
+        segments=[(4, 6), (9, 10)],
+        episodes=np.array([1, 2]),
+        scores=np.array([-0.5, -0.7]),
+        num_relevant=7,
+        num_scored=5,
+        milliseconds=1.5,
+    )
+    agent = make_agent('gcbc', obs_dim=2, act_dim=2, hidden=(4,))
+    adaptation = Adaptation(agent, [3.0, 2.0], [4.0, 3.5, 3.6], 1, True, '', 0.25)
+    message = report_message(
+        to_time(0), query_id=3, episode_id=2, support=support, adaptation=adaptation
+    )
+    assert (message.relevant_trajectories, message.kept_trajectories) == (7, 2)
+    assert (message.transitions, message.filter_ms, message.adapt_ms) == (3, 1.5, 250.0)
+    assert (list(message.segment_starts), list(message.segment_stops)) == ([4, 9], [6, 10])
+    assert (message.steps, message.best_step, message.accepted) == (2, 1, True)
+    assert list(message.train_losses) == [3.0, 2.0]
+    assert list(message.test_losses) == [4.0, 3.5, 3.6]
+
+
+def test_report_message_without_a_result_keeps_the_reason() -> None:
+    message = report_message(
+        to_time(0), query_id=3, episode_id=2, support=None, adaptation=None, reason='cancelled'
+    )
+    assert (message.reason, message.accepted, message.transitions) == ('cancelled', False, 0)
+
+
+def test_occupancy_grid_starts_at_the_lower_left_corner() -> None:
+    maze = MazeMap.from_rows(('###', '#.#', '#..'), unit_m=4.0, origin_xy=(-4.0, -8.0))
+    grid = occupancy_grid(maze, Header(frame_id='map'))
+    assert (grid.info.width, grid.info.height, grid.info.resolution) == (3, 3, 4.0)
+    assert (grid.info.origin.position.x, grid.info.origin.position.y) == (-6.0, -10.0)
+    assert list(grid.data) == [100, 100, 100, 100, 0, 100, 100, 0, 0]
