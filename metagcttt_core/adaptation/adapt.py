@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import time
 
 import numpy as np
+import torch
 
 from metagcttt_core.adaptation.batches import QueryBatches
 from metagcttt_core.adaptation.config import TTTConfig
@@ -62,8 +63,9 @@ def adapt(
         should_stop: Asked before every gradient step; true cancels.
 
     Returns:
-        The expert and its losses. An empty support, zero steps or, with early stopping, a held-out
-        loss that only got worse gives the base agent, not accepted, with the reason.
+        The expert and its losses. An empty support, zero steps, weights that became non-finite or,
+        with early stopping, a held-out loss that only got worse give the base agent, not accepted,
+        with the reason.
 
     Raises:
         AdaptationCancelled: When `should_stop` returned true.
@@ -120,6 +122,8 @@ def adapt(
         return base(
             'the held-out loss never fell below its start', result.test_losses, result.train_losses
         )
+    if not all(torch.isfinite(weight).all() for weight in result.agent.parameters()):
+        return base('the adapted weights are not finite', result.test_losses, result.train_losses)
     return Adaptation(
         agent=result.agent,
         train_losses=result.train_losses,

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+import math
 from typing import Any
 
 import torch
@@ -72,8 +73,9 @@ def run_inner_loop(
         with torch.no_grad():
             loss = agent.losses(test_batch, actor_only=actor_only)[0].item()
         test_losses.append(loss)
-        if loss < best_loss:
-            best_step, best_loss = step, loss
+        rank = loss if math.isfinite(loss) else math.inf
+        if step == 0 or rank < best_loss:
+            best_step, best_loss = step, rank
             best_weights = [tensor.detach().clone() for tensor in agent.state_dict().values()]
 
     step = 0
