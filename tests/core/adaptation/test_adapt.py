@@ -1,0 +1,347 @@
+"""Test-time training for one query: from a base agent to an expert, or a reason why not."""
+
+from collections import defaultdict
+
+from metagcttt_core import (
+    adapt,
+    FilterConfig,
+    SupportSet,
+    TrajectoryDataset,
+    TrajectoryFilter,
+    TTTConfig,
+)
+from metagcttt_core.adaptation import AdaptationCancelled
+from metagcttt_core.agents import AGENTS, GCBC
+import numpy as np
+import pytest
+from tests.core.builders import (
+    assert_bit_equal,
+    assert_changed,
+    random_dataset,
+    tiny_agent,
+    weights_of,
+)
+import torch
+
+EVERY_AGENT = pytest.mark.parametrize('name', sorted(AGENTS))
+GOAL = np.array([0.5, -1.5])
+
+
+def support_of(rows) -> SupportSet:
+    return SupportSet(np.array(rows, np.int64), [], np.zeros(0), np.zeros(0), 1, 1)
+
+
+@pytest.fixture
+def dataset() -> TrajectoryDataset:
+    return random_dataset([12, 12, 12])
+
+
+def quick(**settings) -> TTTConfig:
+    return TTTConfig(**{'steps': 4, 'lr': 0.05, 'batch_size': 8, **settings})
+
+
+@pytest.fixture
+def tested(monkeypatch) -> list[dict[str, torch.Tensor]]:
+    """Every batch whose loss is taken without gradients: the held-out ones."""
+    seen, losses = [], GCBC.losses
+
+    def spy(agent, batch, *, actor_only=False):
+        if not torch.is_grad_enabled():
+            seen.append(batch)
+        return losses(agent, batch, actor_only=actor_only)
+
+    monkeypatch.setattr(GCBC, 'losses', spy)
+    return seen
+
+
+@EVERY_AGENT
+@pytest.mark.parametrize('early_stopping', [False, True])
+@pytest.mark.parametrize('actor_only', [False, True])
+def test_base_agent_stays_bit_equal(name, early_stopping, actor_only, dataset):
+    agent = tiny_agent(name)
+    agent.metadata = {'environment': 'maze'}
+    weights = weights_of(agent)
+    config = quick(early_stopping=early_stopping, actor_only=actor_only)
+    result = adapt(agent, dataset, support_of(range(11)), GOAL, config)
+    assert_bit_equal(agent, weights)
+    assert agent.metadata == {'environment': 'maze'}
+    assert result.accepted
+    assert result.reason == ''
+    assert result.agent is not agent
+    assert_changed(result.agent, weights)
+    assert result.seconds > 0
+    assert len(result.train_losses) == 4
+    assert len(result.test_losses) == (5 if early_stopping else 0)
+    for key, weight in result.agent.state_dict().items():
+        if actor_only and not key.startswith('actor.'):
+            assert torch.equal(weight, weights[key])
+
+
+@EVERY_AGENT
+def test_result_depends_on_the_seed_alone(name, dataset):
+    agent = tiny_agent(name)
+    runs = []
+    for torch_seed, seed in ((0, 3), (1, 3), (1, 4)):
+        torch.manual_seed(torch_seed)
+        np.random.seed(torch_seed)
+        config = quick(early_stopping=True)
+        runs.append(adapt(agent, dataset, support_of(range(30)), GOAL, config, seed=seed))
+    first, again, other = runs
+    assert_bit_equal(again.agent, weights_of(first.agent))
+    assert (again.train_losses, again.test_losses) == (first.train_losses, first.test_losses)
+    assert other.train_losses != first.train_losses
+
+
+def test_one_sgd_step_on_one_transition_by_hand(dataset):
+    """With the mean m and the hidden units h: db = lr (a - m), dW = lr (a - m) h^T."""
+    agent = tiny_agent()
+    row, lr = 13, 0.2
+    result = adapt(agent, dataset, support_of([row]), GOAL, quick(steps=1, lr=lr, optimizer='sgd'))
+    inputs = torch.tensor(np.concatenate([dataset.observations[row], GOAL]), dtype=torch.float32)
+    action = torch.from_numpy(dataset.actions[row])
+    with torch.no_grad():
+        hidden = torch.nn.functional.gelu(agent.actor.fc0(inputs), approximate='tanh')
+        error = action - agent.actor.mean(hidden)
+    head, adapted = agent.actor.mean, result.agent.actor.mean
+    torch.testing.assert_close(adapted.bias, head.bias + lr * error)
+    torch.testing.assert_close(adapted.weight, head.weight + lr * torch.outer(error, hidden))
+    first = agent.actor.fc0
+    log_prob, _ = agent.log_prob(inputs[None, :2], inputs[None, 2:], action[None])
+    gradient = torch.autograd.grad(-log_prob.mean(), first.weight)[0]
+    torch.testing.assert_close(result.agent.actor.fc0.weight, first.weight - lr * gradient)
+    assert result.train_losses == pytest.approx([-log_prob.item()], rel=1e-5)
+    assert result.best_step == 1
+
+
+def test_adam_steps_on_one_transition_equal_a_torch_loop(dataset):
+    agent = tiny_agent()
+    result = adapt(agent, dataset, support_of([13]), GOAL, quick(steps=7, lr=0.01))
+    copy = agent.clone()
+    optimizer = torch.optim.Adam(copy.parameters(), lr=0.01)
+    batch = {
+        'observations': torch.from_numpy(dataset.observations[[13]]),
+        'actions': torch.from_numpy(dataset.actions[[13]]),
+        'actor_goals': torch.from_numpy(GOAL[None].astype(np.float32)),
+    }
+    losses = []
+    for _ in range(7):
+        optimizer.zero_grad()
+        loss, _ = copy.losses(batch)
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    for name, weight in copy.state_dict().items():
+        torch.testing.assert_close(result.agent.state_dict()[name], weight, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(result.train_losses, losses, rtol=1e-5)
+
+
+def test_adapting_lowers_the_loss_towards_the_goal(dataset):
+    agent = tiny_agent()
+    support = support_of(range(11))
+    result = adapt(agent, dataset, support, GOAL, quick(steps=60, batch_size=64))
+    assert result.train_losses[-1] < result.train_losses[0] - 0.01
+    rows = np.arange(11)
+    before, after = (
+        np.square(policy.act(dataset.observations[rows], GOAL) - dataset.actions[rows]).mean()
+        for policy in (agent, result.agent)
+    )
+    assert after < before
+
+
+def test_held_out_rows_are_never_trained_on_and_their_best_weights_kept(
+    dataset, tested, monkeypatch
+):
+    trained = defaultdict(int)
+    spied = GCBC.losses
+
+    def count(agent, batch, *, actor_only=False):
+        if torch.is_grad_enabled():
+            for observation in batch['observations'].numpy():
+                trained[observation.tobytes()] += 1
+        return spied(agent, batch, actor_only=actor_only)
+
+    monkeypatch.setattr(GCBC, 'losses', count)
+    agent = tiny_agent()
+    config = quick(steps=15, lr=0.1, early_stopping=True, test_fraction=0.3)
+    result = adapt(agent, dataset, support_of(range(11)), GOAL, config)
+    assert len(tested) == len(result.test_losses) == 16
+    held_out = {observation.tobytes() for observation in tested[0]['observations'].numpy()}
+    assert len(held_out) == 3
+    assert not held_out & trained.keys()
+    assert len(trained) == 8
+    assert (tested[0]['actor_goals'].numpy() == GOAL.astype(np.float32)).all()
+    assert result.best_step == int(np.argmin(result.test_losses)) > 0
+    loss, _ = result.agent.losses(tested[0])
+    assert loss.item() == min(result.test_losses)
+    base_loss, _ = agent.losses(tested[0])
+    assert base_loss.item() == result.test_losses[0]
+
+
+def test_test_split_has_at_most_max_test_transitions(tested):
+    dataset = random_dataset([60])
+    config = quick(steps=1, early_stopping=True, test_fraction=0.5, max_test=7)
+    adapt(tiny_agent(), dataset, support_of(range(59)), GOAL, config)
+    assert len(tested[0]['observations']) == 7
+
+
+def test_adaptation_that_only_makes_the_held_out_loss_worse_is_rejected(dataset):
+    agent = tiny_agent()
+    weights = weights_of(agent)
+    config = quick(lr=50, optimizer='sgd', early_stopping=True)
+    result = adapt(agent, dataset, support_of(range(11)), GOAL, config)
+    assert min(result.test_losses[1:]) > result.test_losses[0]
+    assert result.agent is agent
+    assert not result.accepted
+    assert result.best_step == 0
+    assert result.reason == 'the held-out loss never fell below its start'
+    assert (len(result.train_losses), len(result.test_losses)) == (4, 5)
+    assert_bit_equal(agent, weights)
+
+
+def test_weights_that_become_non_finite_are_rejected(dataset):
+    agent = tiny_agent()
+    result = adapt(agent, dataset, support_of(range(11)), GOAL, quick(lr=1e30, optimizer='sgd'))
+    assert (result.agent is agent, result.accepted) == (True, False)
+    assert result.reason == 'the adapted weights are not finite'
+    assert not np.isfinite(result.train_losses).all()
+
+
+@pytest.mark.parametrize('rows', [[], [11], [11, 23, 35]], ids=['none', 'last', 'only-last'])
+@pytest.mark.parametrize('early_stopping', [False, True])
+def test_support_without_transitions_gives_the_base_agent(rows, early_stopping, dataset):
+    agent = tiny_agent()
+    config = quick(early_stopping=early_stopping)
+    result = adapt(agent, dataset, support_of(rows), GOAL, config)
+    assert (result.agent is agent, result.accepted, result.best_step) == (True, False, 0)
+    assert result.reason == 'the filtered dataset is empty'
+    assert (result.train_losses, result.test_losses) == ([], [])
+
+
+def test_empty_query_result_gives_the_base_agent(dataset):
+    support = TrajectoryFilter(dataset).query(np.full(2, 1e3), GOAL)
+    result = adapt(tiny_agent(), dataset, support, GOAL, quick())
+    assert result.reason == 'the filtered dataset is empty'
+
+
+@pytest.mark.parametrize('rows', [[3], [3, 11]], ids=['one', 'one-and-a-last'])
+def test_support_too_small_to_split_gives_the_base_agent(rows, dataset):
+    agent = tiny_agent()
+    # Whichever of the two rows is held out, one part is left without a transition.
+    results = [
+        adapt(agent, dataset, support_of(rows), GOAL, quick(early_stopping=True), seed=seed)
+        for seed in range(6)
+    ]
+    for result in results:
+        assert (result.agent is agent, result.accepted) == (True, False)
+    reasons = {result.reason for result in results}
+    assert reasons <= {
+        'the filtered dataset is empty',
+        'the filtered dataset is too small to hold out a test split',
+    }
+
+
+def test_zero_steps_give_the_base_agent(dataset):
+    agent = tiny_agent()
+    result = adapt(agent, dataset, support_of(range(11)), GOAL, quick(steps=0))
+    assert (result.agent is agent, result.accepted, result.best_step) == (True, False, 0)
+    assert result.reason == 'no adaptation steps were asked for'
+
+
+def test_cancelled_within_one_step(dataset):
+    agent = tiny_agent()
+    weights = weights_of(agent)
+    asked = []
+
+    def should_stop():
+        asked.append(1)
+        return len(asked) == 3
+
+    with pytest.raises(AdaptationCancelled, match='cancelled before inner step 3'):
+        adapt(
+            agent,
+            dataset,
+            support_of(range(11)),
+            GOAL,
+            quick(steps=1000, early_stopping=True),
+            should_stop=should_stop,
+        )
+    assert len(asked) == 3
+    assert_bit_equal(agent, weights)
+
+
+def test_pretrained_optimizer_state_is_used(dataset):
+    agent = tiny_agent()
+    state = {
+        number: {
+            'step': torch.tensor(1000.0),
+            'exp_avg': torch.full_like(weight, 0.5),
+            'exp_avg_sq': torch.full_like(weight, 0.25),
+        }
+        for number, weight in enumerate(agent.trained_parameters())
+    }
+    config = quick(steps=1, lr=1e-3, optimizer_state='pretrained')
+    arguments = (agent, dataset, support_of([13]), GOAL)
+    result = adapt(*arguments, config, optimizer_state=state)
+    fresh = adapt(*arguments, quick(steps=1, lr=1e-3), optimizer_state=state)
+    batch = {
+        'observations': torch.from_numpy(dataset.observations[[13]]),
+        'actions': torch.from_numpy(dataset.actions[[13]]),
+        'actor_goals': torch.from_numpy(GOAL[None].astype(np.float32)),
+    }
+    gradients = torch.autograd.grad(agent.losses(batch)[0], list(agent.parameters()))
+    for before, gradient, after, restarted in zip(
+        agent.parameters(),
+        gradients,
+        result.agent.parameters(),
+        fresh.agent.parameters(),
+        strict=True,
+    ):
+        # Adam's step 1001 by hand.
+        first = (0.9 * 0.5 + 0.1 * gradient) / (1 - 0.9**1001)
+        second = (0.999 * 0.25 + 0.001 * gradient.square()) / (1 - 0.999**1001)
+        expected = before - 1e-3 * first / (second.sqrt() + 1e-8)
+        torch.testing.assert_close(after, expected, rtol=1e-5, atol=1e-6)
+        restart = before - 1e-3 * gradient / (gradient.abs() + 1e-8)
+        torch.testing.assert_close(restarted, restart, rtol=1e-4, atol=1e-6)
+    again = adapt(*arguments, config, optimizer_state=state)
+    assert_bit_equal(again.agent, weights_of(result.agent))
+
+
+def test_memory_mapped_dataset_gives_the_same_expert(dataset, tmp_path):
+    dataset.save(tmp_path / 'data.npz')
+    mapped = TrajectoryDataset.load(tmp_path / 'data.npz', memory_map=True)
+    agent = tiny_agent('gciql')
+    expected, result = (
+        adapt(agent, data, support_of(range(11)), GOAL, quick(early_stopping=True))
+        for data in (dataset, mapped)
+    )
+    assert_bit_equal(result.agent, weights_of(expected.agent))
+
+
+def test_support_of_a_real_query_makes_an_expert(dataset):
+    state, goal = dataset.observations[0], dataset.observations[8]
+    support = TrajectoryFilter(dataset, FilterConfig(epsilon=2.0)).query(state, goal)
+    assert support
+    first = adapt(tiny_agent(), dataset, support, goal, quick())
+    weights = weights_of(first.agent)
+    second = adapt(first.agent, dataset, support, goal, quick())
+    assert first.accepted
+    assert second.accepted
+    assert_bit_equal(first.agent, weights)
+    assert_changed(second.agent, weights)
+
+
+@pytest.mark.parametrize(
+    ('agent_settings', 'goal', 'ttt', 'message'),
+    [
+        ({'obs_dim': 3}, np.zeros(3), {}, 'obs_dim is 3 for the agent and 2 for the dataset'),
+        ({'act_dim': 1}, GOAL, {}, 'act_dim is 1 for the agent and 2 for the dataset'),
+        ({}, np.zeros(3), {}, r'goal must have shape \(2,\), got \(3,\)'),
+        ({}, np.zeros((1, 2)), {}, r'goal must have shape \(2,\), got \(1, 2\)'),
+        ({}, np.array([0, np.inf]), {}, 'goal holds a non-finite value'),
+        ({}, GOAL, {'optimizer_state': 'pretrained'}, 'needs the optimiser state of pre-training'),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(agent_settings, goal, ttt, message, dataset):
+    with pytest.raises(ValueError, match=message):
+        adapt(tiny_agent(**agent_settings), dataset, support_of([0]), goal, quick(**ttt))
