@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 import hashlib
 import json
 from pathlib import Path
+import re
 from typing import Any
 
 from pydantic import Field, ValidationError
@@ -12,7 +13,7 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from metagcttt_core.agents import AGENTS, make_agent
+from metagcttt_core.agents import AGENTS
 from metagcttt_core.agents.agent import Agent
 from metagcttt_core.config.settings import error_lines, Settings
 from metagcttt_core.files import atomic_write
@@ -72,9 +73,14 @@ def save_checkpoint(agent: Agent, path: str | Path, training: TrainingState | No
         training: The state of the run, to be resumed later.
 
     Raises:
-        OSError: If the folder cannot be written; the previous checkpoint is still there.
+        CheckpointError: If a weight is not finite; such a checkpoint could not be loaded.
+        OSError: If the folder cannot be written.
+        After either, the previous checkpoint is still there.
     """
     folder = Path(path)
+    for name, tensor in agent.state_dict().items():
+        if not torch.isfinite(tensor).all():
+            raise CheckpointError(f'{folder}: not saved, weight {name} holds a non-finite value')
     tensors = {f'agent.{name}': tensor for name, tensor in agent.state_dict().items()}
     if training is not None:
         for number, state in training.optimizer.items():
@@ -124,12 +130,12 @@ def load_checkpoint(path: str | Path, *, environment: str | None = None) -> Agen
         raise CheckpointError(
             f'{folder}: unknown agent {index.agent!r}; known: {", ".join(AGENTS)}'
         )
+    agent_type = AGENTS[index.agent]
     try:
-        agent = make_agent(
-            index.agent, obs_dim=index.obs_dim, act_dim=index.act_dim, **index.settings
-        )
+        settings = agent_type.settings_type(**index.settings)
     except ValidationError as error:
         raise CheckpointError(f'{folder}: settings: {"; ".join(error_lines(error))}') from error
+    agent = agent_type(index.obs_dim, index.act_dim, settings, torch.Generator())
     own = agent.state_dict()
     saved = {name[6:]: tensor for name, tensor in tensors.items() if name.startswith('agent.')}
     missing, unknown = sorted(own.keys() - saved.keys()), sorted(saved.keys() - own.keys())
@@ -142,6 +148,10 @@ def load_checkpoint(path: str | Path, *, environment: str | None = None) -> Agen
             raise CheckpointError(
                 f'{folder}: weight {name} has shape {tuple(saved[name].shape)}, '
                 f'the settings ask for {tuple(tensor.shape)}'
+            )
+        if saved[name].dtype != tensor.dtype:
+            raise CheckpointError(
+                f'{folder}: weight {name} is {saved[name].dtype}, expected {tensor.dtype}'
             )
         if not torch.isfinite(saved[name]).all():
             raise CheckpointError(f'{folder}: weight {name} holds a non-finite value')
@@ -162,9 +172,14 @@ def load_training_state(path: str | Path) -> TrainingState:
         raise CheckpointError(f'{folder}: was saved without a training state, cannot be resumed')
     optimizer: dict[int, dict[str, Tensor]] = {}
     for name, tensor in _read_tensors(folder, index).items():
-        if name.startswith('optimizer.'):
-            _, number, key = name.split('.')
-            optimizer.setdefault(int(number), {})[key] = tensor
+        if name.startswith('agent.'):
+            continue
+        match = re.fullmatch(r'optimizer\.(\d+)\.(\w+)', name)
+        if match is None:
+            raise CheckpointError(f'{folder}: unknown tensor {name}')
+        if not torch.isfinite(tensor).all():
+            raise CheckpointError(f'{folder}: {name} holds a non-finite value')
+        optimizer.setdefault(int(match[1]), {})[match[2]] = tensor
     training = index.training
     return TrainingState(training.stage, training.step, training.settings, optimizer)
 
@@ -183,7 +198,7 @@ def _read_index(folder: Path) -> _Index:
     file = folder / _INDEX
     try:
         values = json.loads(file.read_text(encoding='utf-8'))
-    except FileNotFoundError as error:
+    except (FileNotFoundError, NotADirectoryError) as error:
         raise CheckpointError(f'{folder}: no checkpoint there ({_INDEX} is missing)') from error
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
         raise CheckpointError(f'{file}: not valid JSON ({error})') from error

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from pydantic_core import to_jsonable_python
 import torch
 
 from metagcttt_core.agents.agent import Agent
@@ -49,7 +50,7 @@ class TrainingRun:
             should_stop: Asked after every step; true saves a checkpoint and ends the run.
         """
         self._stage = stage
-        self._settings = settings
+        self._settings = to_jsonable_python(settings)  # as they come back from a checkpoint
         self._folder = folder
         self._every = every
         self._resume = resume
