@@ -1,0 +1,40 @@
+"""atomic_write: the old content or the new, never a part."""
+
+from metagcttt_core.files import atomic_write
+import pytest
+
+
+def test_new_content_replaces_the_old(tmp_path):
+    path = tmp_path / 'a' / 'file'
+    for content in (b'one', b'two'):
+        with atomic_write(path) as file:
+            file.write(content)
+        assert path.read_bytes() == content
+    assert [entry.name for entry in path.parent.iterdir()] == ['file']
+    assert path.stat().st_mode & 0o777 == 0o644
+
+
+def test_old_content_stays_until_the_end(tmp_path):
+    path = tmp_path / 'file'
+    path.write_bytes(b'old')
+    with atomic_write(path) as file:
+        file.write(b'new')
+        file.flush()
+        assert path.read_bytes() == b'old'
+
+
+@pytest.mark.parametrize('error', [ValueError, KeyboardInterrupt, SystemExit])
+def test_failing_block_leaves_the_old_content_and_nothing_else(error, tmp_path):
+    path = tmp_path / 'file'
+    path.write_bytes(b'old')
+    with pytest.raises(error), atomic_write(path) as file:
+        file.write(b'half')
+        raise error
+    assert path.read_bytes() == b'old'
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_failing_block_makes_no_file(tmp_path):
+    with pytest.raises(ValueError, match='no'), atomic_write(tmp_path / 'file'):
+        raise ValueError('no')
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,60 @@
+"""The optimisers: torch's own results, and what they leave untouched."""
+
+from metagcttt_core.training.optimizers import make_optimizer
+import pytest
+import torch
+from torch import nn
+
+
+def stepped(optimizer, weight: nn.Parameter, gradients) -> torch.Tensor:
+    for gradient in gradients:
+        weight.grad = gradient.clone()
+        optimizer.step()
+    return weight.detach().clone()
+
+
+GRADIENTS = [torch.tensor([0.5, -2.0, 1e-4]), torch.tensor([-0.1, 3.0, 2e-4])]
+
+
+@pytest.mark.parametrize(
+    ('name', 'reference'), [('adam', torch.optim.Adam), ('sgd', torch.optim.SGD)]
+)
+def test_steps_equal_torch(name, reference):
+    ours, theirs = (nn.Parameter(torch.tensor([1.0, -1.0, 0.5])) for _ in range(2))
+    result = stepped(make_optimizer(name, [ours], 0.1), ours, GRADIENTS)
+    expected = stepped(reference([theirs], lr=0.1), theirs, GRADIENTS)
+    torch.testing.assert_close(result, expected, rtol=1e-6, atol=1e-7)
+
+
+def test_adam_by_hand():
+    """Eps is added after bias correction, outside the square root."""
+    weight = nn.Parameter(torch.tensor([1.0]))
+    result = stepped(make_optimizer('adam', [weight], 0.1), weight, [torch.tensor([1e-8])])
+    assert result.item() == pytest.approx(1 - 0.1 * 1e-8 / (1e-8 + 1e-8), rel=1e-6)
+
+
+def test_given_state_is_used_and_not_changed():
+    first = nn.Parameter(torch.zeros(3))
+    optimizer = make_optimizer('adam', [first], 0.1)
+    stepped(optimizer, first, GRADIENTS)
+    state = optimizer.state_dict()['state']
+    before = {key: tensor.clone() for key, tensor in state[0].items()}
+    results = []
+    for _ in range(2):
+        weight = nn.Parameter(first.detach().clone())
+        results.append(stepped(make_optimizer('adam', [weight], 0.1, state), weight, GRADIENTS))
+    assert torch.equal(results[0], results[1])
+    assert all(torch.equal(state[0][key], tensor) for key, tensor in before.items())
+    assert torch.equal(results[0], stepped(optimizer, first, GRADIENTS))
+
+
+@pytest.mark.parametrize('name', ['adam', 'sgd'])
+def test_every_step_raises_the_version_of_the_weights(name):
+    """Caches of values notice by it that a network has changed."""
+    weight = nn.Parameter(torch.ones(3))
+    optimizer = make_optimizer(name, (parameter for parameter in [weight]), 0.1)
+    versions = []
+    for gradient in GRADIENTS:
+        stepped(optimizer, weight, [gradient])
+        versions.append(weight._version)
+    assert 0 < versions[0] < versions[1]
