@@ -124,7 +124,12 @@ class MazeClient(Node):
             'the adaptation report',
             timeout_s,
         )
-        states = [state for state in self._seen.states if state.episode_id == answer.episode_id]
+        self.wait(
+            lambda: any(s.step >= end.step for s in self._states(answer.episode_id)),
+            'the last state',
+            timeout_s,
+        )
+        states = self._states(answer.episode_id)
         return GoalOutcome(
             success=end.kind == EpisodeEvent.REACHED,
             steps=end.step - accepted.step,
@@ -154,6 +159,9 @@ class MazeClient(Node):
             # The goal node had not seen the new episode's first state yet.
             if time.monotonic() > deadline:
                 raise NoAnswerError('the goal node does not see the new episode')
+
+    def _states(self, episode_id: int) -> list[MazeState]:
+        return [state for state in self._seen.states if state.episode_id == episode_id]
 
     def _answers(self, known: int) -> list[EpisodeEvent]:
         kinds = (EpisodeEvent.GOAL_ACCEPTED, EpisodeEvent.GOAL_REJECTED)

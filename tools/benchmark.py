@@ -1,0 +1,20 @@
+"""Measure speed against a baseline in the same run; prints a table, writes JSON."""
+
+import tyro
+
+from tools.benchmarks.retrieval import RetrievalBenchmark
+
+_DESCRIPTION = """Measure speed against a baseline in the same run.
+
+Example: python -m tools.benchmark retrieval"""
+
+BENCHMARKS = {'retrieval': RetrievalBenchmark}
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run the tool."""
+    tyro.extras.subcommand_cli_from_dict(BENCHMARKS, args=argv, description=_DESCRIPTION).run()
+
+
+if __name__ == '__main__':
+    main()
