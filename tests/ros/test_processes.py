@@ -5,6 +5,7 @@ import signal
 import subprocess
 import time
 
+from ament_index_python import get_package_prefix
 from metagcttt_core.config.assets import assets_dir
 from metagcttt_interfaces.msg import EpisodeEvent
 import pytest
@@ -12,7 +13,7 @@ from tools.node_process import NodeProcess
 
 from tests.ros.graph import ANY, goal_pose, Graph, Record
 
-ROS2RUN = Path(__file__).parents[2] / 'tools' / 'ros2run'
+EXECUTABLES = Path(get_package_prefix('metagcttt')) / 'lib' / 'metagcttt'
 NODES = ('goal_node', 'policy_node', 'sim_bridge_node')
 
 
@@ -24,7 +25,7 @@ def start(ros_domain: int) -> Iterator[Callable[..., subprocess.Popen]]:
     def start(*command: str, **environment: str) -> subprocess.Popen:
         processes.append(
             subprocess.Popen(
-                [str(ROS2RUN), 'metagcttt', *command],
+                [str(EXECUTABLES / command[0]), *command[1:]],
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 text=True,

@@ -24,9 +24,12 @@ ARGUMENTS = (
     ),
     DeclareLaunchArgument(
         'params_file',
-        default_value=PathJoinSubstitution(
-            [FindPackageShare('metagcttt'), 'config', [LaunchConfiguration('stepping'), '.yaml']]
-        ),
+        default_value=[
+            PathJoinSubstitution(
+                [FindPackageShare('metagcttt'), 'config', LaunchConfiguration('stepping')]
+            ),
+            '.yaml',
+        ],
         description='parameter file of the three nodes, instead of the one for `stepping`',
     ),
     DeclareLaunchArgument(

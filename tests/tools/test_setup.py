@@ -1,0 +1,162 @@
+from collections.abc import Callable, Iterator
+import fcntl
+from importlib.metadata import distribution, PackageNotFoundError
+import os
+from pathlib import Path
+import re
+import shutil
+import subprocess
+import sys
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+import pytest
+
+ROOT = Path(__file__).parents[2]
+NEEDED = (
+    *('bash', 'cat', 'cut', 'dirname', 'find', 'flock', 'rm', 'sha256sum', 'sort', 'tail'),
+    *('uname', 'xargs', 'make', 'cmake', 'c++'),
+)
+PYTHONS = ('python3.11', 'python3.12', 'python3.13', 'python3')
+
+
+class Machine:
+    """A copy of the set-up script and a PATH with chosen tools."""
+
+    def __init__(self, folder: Path) -> None:
+        self.root = folder / 'checkout'
+        self.path = folder / 'bin'
+        (self.root / 'tools').mkdir(parents=True)
+        (self.root / 'ros2_ws').mkdir()
+        self.path.mkdir()
+        for name in (
+            'constraints.txt',
+            'pyproject.toml',
+            'tools/setup.sh',
+            'tools/fix_ros_wheels.py',
+        ):
+            shutil.copy(ROOT / name, self.root / name)
+        for tool in NEEDED:
+            (self.path / tool).symlink_to(shutil.which(tool))
+
+    def tool(self, name: str, script: str) -> None:
+        """Put a program on the PATH."""
+        (self.path / name).write_text(f'#!/bin/bash\n{script}\n')
+        (self.path / name).chmod(0o755)
+
+    def start(self, **environment: str) -> subprocess.Popen:
+        """Run the set-up."""
+        return subprocess.Popen(
+            [str(self.root / 'tools' / 'setup.sh')],
+            env={'PATH': str(self.path), 'HOME': os.environ.get('HOME', '/'), **environment},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def complaint(self, **environment: str) -> str:
+        """What the set-up fails with."""
+        process = self.start(**environment)
+        _, errors = process.communicate(timeout=60)
+        assert process.returncode == 1
+        return errors
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Machine:
+    return Machine(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ('tool', 'message'),
+    [
+        ('cmake', 'cmake is missing: install it (Debian, Ubuntu: apt install cmake)'),
+        ('make', 'make is missing: install it (Debian, Ubuntu: apt install make)'),
+        ('c++', 'a C++ compiler (c++) is missing: install it (Debian, Ubuntu: apt install g++)'),
+        ('flock', 'flock is missing: install it (Debian, Ubuntu: apt install util-linux)'),
+    ],
+)
+def test_missing_tool_ends_the_setup_with_one_line(
+    machine: Machine, tool: str, message: str
+) -> None:
+    (machine.path / tool).unlink()
+    assert machine.complaint() == f'setup: {message}\n'
+
+
+def test_compiler_named_by_cxx_counts(machine: Machine) -> None:
+    assert 'a C++ compiler (nosuch++) is missing' in machine.complaint(CXX='nosuch++')
+
+
+def test_no_python_ends_the_setup_with_one_line(machine: Machine) -> None:
+    errors = machine.complaint()
+    assert errors.startswith('setup: no suitable Python: install Python 3.11, 3.12 or 3.13')
+    assert errors.count('\n') == 1
+
+
+def test_every_unsuitable_python_is_named_with_its_fault(machine: Machine) -> None:
+    machine.tool('python3.11', 'exit 127')  # what a version manager leaves behind
+    python = f'exec "{sys.executable}" -c "import sys; sys.version_info = (3, 10, 0)'
+    old = f'[ "$1" = -c ] && exit 0\n{python}; exec(open(0).read())" "${{@:2}}"'
+    machine.tool('python3', old)
+    errors = machine.complaint()
+    assert '(python3.11 does not run; python3 is version 3.10)' in errors
+    assert errors.count('\n') == 1
+
+
+def test_another_ros_is_refused(machine: Machine) -> None:
+    assert machine.complaint(ROS_DISTRO='humble') == (
+        'setup: ROS 2 humble is sourced, Jazzy is needed: source Jazzy, '
+        'or use a shell without ROS\n'
+    )
+
+
+@pytest.fixture
+def hold_lock(machine: Machine) -> Iterator[Callable[[], None]]:
+    with (machine.root / '.setup.lock').open('w') as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield lambda: fcntl.flock(lock, fcntl.LOCK_UN)
+
+
+def test_second_setup_waits_for_the_first(machine: Machine, hold_lock) -> None:
+    process = machine.start()
+    assert process.stdout.readline() == 'setup: another set-up is running; waiting for it\n'
+    assert process.poll() is None
+    hold_lock()
+    assert 'no suitable Python' in process.communicate(timeout=60)[1]
+
+
+def pins() -> dict[str, str]:
+    lines = (ROOT / 'constraints.txt').read_text().splitlines()
+    pairs = (line.split('==') for line in lines if line and not line.startswith('#'))
+    return {canonicalize_name(name): version for name, version in pairs}
+
+
+def requirements(name: str, extras: frozenset[str]) -> Iterator[Requirement]:
+    """What an installed distribution with these extras needs in this environment."""
+    for text in distribution(name).requires or ():
+        requirement = Requirement(text)
+        environments = [{'extra': extra} for extra in extras or ('',)]
+        marker = requirement.marker
+        if marker is None or any(marker.evaluate(environment) for environment in environments):
+            yield requirement
+
+
+def test_constraints_pin_all_that_is_installed() -> None:
+    extras = {'dev', 'workspace'} | (set() if 'ROS_DISTRO' in os.environ else {'ros', 'ros-build'})
+    waiting = [('metagcttt-core', frozenset(extras))]
+    seen, loose = set(waiting), []
+    while waiting:
+        for requirement in requirements(*waiting.pop()):
+            name, wanted = canonicalize_name(requirement.name), frozenset(requirement.extras)
+            try:
+                version = distribution(name).version.split('+')[0]
+            except PackageNotFoundError:
+                loose.append(f'{name} is needed and not installed')
+                continue
+            # PyTorch's GPU builds pin their own libraries.
+            if pins().get(name) != version and not re.match('nvidia-|triton|cuda-', name):
+                loose.append(f'{name} is {version}, pinned to {pins().get(name)}')
+            if (name, wanted) not in seen:
+                seen.add((name, wanted))
+                waiting.append((name, wanted))
+    assert loose == []
