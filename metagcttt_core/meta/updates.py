@@ -80,5 +80,6 @@ GRADIENT_UPDATES = frozenset({'fomaml'})
 
 
 def _mean_weight(experts: Sequence[Expert], name: str) -> torch.Tensor:
-    weights = [expert.result.agent.state_dict()[name] for expert in experts]
-    return weights[0] if len(weights) == 1 else torch.stack(weights).mean(dim=0)
+    # In float64, so that the mean of equal weights is that weight, to the bit.
+    weights = torch.stack([expert.result.agent.state_dict()[name] for expert in experts])
+    return weights.double().mean(dim=0).to(weights.dtype)
