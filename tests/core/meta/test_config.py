@@ -1,0 +1,33 @@
+"""MetaConfig: the paper's defaults and refusals."""
+
+from metagcttt_core import MetaConfig
+from pydantic import ValidationError
+import pytest
+
+
+def test_defaults_are_those_of_the_paper():
+    config = MetaConfig()
+    assert (config.outer_steps, config.meta_batch_size) == (50_000, 1)
+    assert (config.batch_size, config.inner_steps) == (1024, 100)
+    assert (config.early_stopping, config.test_fraction, config.max_test) == (True, 0.2, 128)
+    assert (config.fix_actor_goal, config.ratio, config.actor_only) == (1.0, 1.0, False)
+    assert config.filter.variant == 'paper'
+
+
+@pytest.mark.parametrize(
+    ('settings', 'message'),
+    [
+        ({'algorithm': 'mamml'}, "algorithm\n.*'continual', 'fomaml'"),
+        ({'outer_steps': 0}, 'outer_steps\n.*greater than or equal to 1'),
+        ({'inner_steps': 0}, 'inner_steps\n.*greater than or equal to 1'),
+        ({'inner_lr': -1e-3}, 'inner_lr\n.*greater than 0'),
+        ({'meta_lr': 0}, 'meta_lr\n.*greater than 0'),
+        ({'meta_batch_size': 0}, 'meta_batch_size\n.*greater than or equal to 1'),
+        ({'test_fraction': 1.0}, 'test_fraction\n.*less than 1'),
+        ({'filter': {'epsilon': -1}}, 'filter.epsilon\n.*greater than 0'),
+        ({'outer_step': 3}, "no setting 'outer_step'; did you mean 'outer_steps'"),
+    ],
+)
+def test_wrong_setting_is_refused_by_name(settings, message):
+    with pytest.raises(ValidationError, match=message):
+        MetaConfig(**settings)
