@@ -51,6 +51,9 @@ class TrajectoryDataset:
         self.source = source
         self.episode_ends = np.flatnonzero(terminals).astype(np.int64)
         self.episode_starts = np.concatenate([[0], self.episode_ends[:-1] + 1]).astype(np.int64)
+        lengths = np.diff(self.episode_ends, prepend=-1)
+        # Set where all trajectories are equally long, so that divisions replace searches.
+        self._episode_length = int(lengths[0]) if np.all(lengths == lengths[0]) else None
         # Transitions (rows with a successor) before each trajectory, for drawing one uniformly.
         self._transition_offsets = self.episode_starts - np.arange(len(self.episode_starts))
 
@@ -163,12 +166,15 @@ class TrajectoryDataset:
 
     def episode_of(self, rows: np.ndarray) -> np.ndarray:
         """The trajectory number of each row, int64 of the same shape."""
+        if self._episode_length:
+            return rows // self._episode_length
         return np.searchsorted(self.episode_ends, rows, side='left')
 
     def transition_rows(self, numbers: np.ndarray) -> np.ndarray:
         """Rows of the transitions with the given running numbers in [0, num_transitions)."""
-        episodes = np.searchsorted(self._transition_offsets, numbers, side='right') - 1
-        return numbers + episodes
+        if self._episode_length and self._episode_length > 1:
+            return numbers + numbers // (self._episode_length - 1)
+        return numbers + np.searchsorted(self._transition_offsets, numbers, side='right') - 1
 
     def sample_transitions(self, count: int, rng: np.random.Generator) -> np.ndarray:
         """Rows drawn uniformly among those that have a successor, (count,) int64.

@@ -14,7 +14,17 @@ from metagcttt_core.retrieval.config import FilterConfig
 from metagcttt_core.retrieval.spatial_index import SpatialIndex
 
 _FORMAT = 1
-_REQUIRED = ('fingerprint', 'order', 'keys', 'starts', 'origin', 'extent', 'stride', 'column0')
+_REQUIRED = (
+    'fingerprint',
+    'order',
+    'keys',
+    'starts',
+    'origin',
+    'extent',
+    'edges',
+    'stride',
+    'column0',
+)
 _log = logging.getLogger(__name__)
 
 

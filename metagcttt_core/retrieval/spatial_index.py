@@ -5,9 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+_MOST_CELLS = 2**30
+
 
 class Neighbours(NamedTuple):
-    """Rows near a point, ascending, and their distances."""
+    """Rows near a point, in no particular order, and their distances."""
 
     rows: np.ndarray
     distances: np.ndarray
@@ -47,6 +49,8 @@ class SpatialIndex:
         planar = [column * factor for column, factor in zip(columns, self._scale, strict=False)]
         self._origin = np.array([values.min() for values in planar])
         self._extent = np.array([values.max() for values in planar])
+        # Far outliers must not make more cells than an integer can number.
+        self._edges = np.maximum(self._cell_size, (self._extent - self._origin) / _MOST_CELLS)
         cells = [self._cell(values, axis) for axis, values in enumerate(planar)]
         self._stride = int(cells[1].max()) + 1 if len(cells) == 2 else 1
         keys = cells[0] * self._stride + (cells[1] if len(cells) == 2 else 0)
@@ -65,6 +69,7 @@ class SpatialIndex:
             'starts': self._starts,
             'origin': self._origin,
             'extent': self._extent,
+            'edges': self._edges,
             'stride': np.array(self._stride),
             **columns,
         }
@@ -72,6 +77,7 @@ class SpatialIndex:
     def _restore(self, saved: Mapping[str, np.ndarray]) -> None:
         self._order, self._keys, self._starts = saved['order'], saved['keys'], saved['starts']
         self._origin, self._extent = saved['origin'], saved['extent']
+        self._edges = saved['edges']
         self._stride = int(saved['stride'])
         self._columns = [saved[f'column{axis}'] for axis in range(len(self._origin))]
 
@@ -98,9 +104,7 @@ class SpatialIndex:
             positions = self._observations[rows][:, self._dims]
             distances = self._distances(list(positions.T), point)
         near = np.flatnonzero(distances < radius if strict else distances <= radius)
-        rows, distances = rows[near], distances[near]
-        ascending = np.argsort(rows, kind='stable')
-        return Neighbours(rows[ascending].astype(np.int64), distances[ascending])
+        return Neighbours(rows[near].astype(np.int64), distances[near])
 
     def nearest(self, point: np.ndarray) -> int:
         """The row nearest to `point`, the first on ties."""
@@ -110,7 +114,7 @@ class SpatialIndex:
         radius = max(self._cell_size, outside)
         while not len((near := self.ball(point, radius)).rows):
             radius *= 2
-        return int(near.rows[np.argmin(near.distances)])
+        return int(near.rows[near.distances == near.distances.min()].min())
 
     def _distances(self, columns: list[np.ndarray], point: np.ndarray) -> np.ndarray:
         """Scaled Euclidean distances (n,), float64, of points given by coordinate to `point`."""
@@ -120,7 +124,7 @@ class SpatialIndex:
         return np.sqrt(squared, out=squared)
 
     def _cell(self, values: np.ndarray, axis: int) -> np.ndarray:
-        return np.floor((values - self._origin[axis]) / self._cell_size).astype(np.int64)
+        return np.floor((values - self._origin[axis]) / self._edges[axis]).astype(np.int64)
 
     def _candidates(self, point: np.ndarray, radius: float) -> list[slice]:
         """Slices of the sorted rows whose cells overlap the ball's bounding box."""

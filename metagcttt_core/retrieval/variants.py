@@ -108,12 +108,12 @@ VARIANTS: dict[str, Callable[[Task, FilterConfig], Candidates]] = {
 def _closest_to_goal(task: Task, episodes: np.ndarray, starts: np.ndarray) -> Best:
     """Per trajectory the state closest to g from its start on, where that is within epsilon."""
     near = task.near_goal()
-    goal_episodes = task.dataset.episode_of(near.rows)
-    slot = np.minimum(np.searchsorted(episodes, goal_episodes), max(len(episodes) - 1, 0))
-    usable = np.zeros(len(near.rows), bool)
-    if len(episodes):
-        usable = (episodes[slot] == goal_episodes) & (near.rows >= starts[slot])
-    return smallest_per_episode(goal_episodes[usable], near.rows[usable], near.distances[usable])
+    data = task.dataset
+    first_usable = np.full(data.num_episodes, data.num_rows)
+    first_usable[episodes] = starts
+    near_episodes = data.episode_of(near.rows)
+    usable = np.flatnonzero(near.rows >= first_usable[near_episodes])
+    return smallest_per_episode(near_episodes[usable], near.rows[usable], near.distances[usable])
 
 
 def _highest_value(task: Task, episodes: np.ndarray, starts: np.ndarray) -> Best:
@@ -134,8 +134,8 @@ def _best(scores: np.ndarray, config: FilterConfig) -> np.ndarray:
 def _gcttt_by_steps(task: Task, config: FilterConfig) -> Candidates:
     """Rank by the fewest steps from a match of s to the first later match of g."""
     data = task.dataset
-    near_s = task.near_state(strict=True).rows
-    near_g = task.near_goal(strict=True).rows
+    near_s = np.sort(task.near_state(strict=True).rows)
+    near_g = np.sort(task.near_goal(strict=True).rows)
     near_g = near_g[data.episode_starts[data.episode_of(near_g)] != near_g]  # never a first row
     episodes = data.episode_of(near_s)
     num_relevant = np.count_nonzero(np.diff(episodes, prepend=-1))
@@ -159,7 +159,7 @@ def _gcttt_by_steps(task: Task, config: FilterConfig) -> Candidates:
 def _gcttt_by_value(task: Task, config: FilterConfig) -> Candidates:
     """Rank by the smallest step distance log(1 + (1 - discount) V) / log(discount)."""
     data = task.dataset
-    near_s = task.near_state(strict=True).rows
+    near_s = np.sort(task.near_state(strict=True).rows)
     near_episodes = data.episode_of(near_s)
     first_slots = np.flatnonzero(np.diff(near_episodes, prepend=-1))
     relevant, firsts = near_episodes[first_slots], near_s[first_slots]
