@@ -1,0 +1,162 @@
+"""Pre-training, post-training and evaluation as a user runs them, in miniature."""
+
+import json
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+from metagcttt_core import load_checkpoint, TrajectoryDataset
+import numpy as np
+import pytest
+from tools import evaluate, meta_train, pretrain
+import torch
+
+SMALL_AGENT = ['--hidden', '16', '16', '--training.batch-size', '32']
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope='module')
+def dataset_path(tmp_path_factory):
+    """Trajectories that wander through the whole maze's square, so that every task finds some."""
+    rng = np.random.default_rng(0)
+    steps = rng.normal(0, 0.6, size=(40, 101, 2)).cumsum(axis=1)
+    observations = (steps + rng.uniform(0, 20, size=(40, 1, 2))).reshape(-1, 2)
+    terminals = np.zeros(len(observations), bool)
+    terminals[100::101] = True
+    actions = np.clip(rng.normal(size=observations.shape), -1, 1)
+    path = tmp_path_factory.mktemp('data') / 'walks.npz'
+    TrajectoryDataset.from_arrays(observations, actions, terminals).save(path)
+    return path
+
+
+@pytest.fixture(scope='module')
+def base(dataset_path, tmp_path_factory):
+    out = tmp_path_factory.mktemp('base')
+    pretrain.main(pretrain_arguments(dataset_path, out, steps=20))
+    return out / 'checkpoint'
+
+
+def pretrain_arguments(dataset_path, out, steps):
+    arguments = ['--dataset', str(dataset_path), '--out', str(out), *SMALL_AGENT]
+    return [*arguments, '--training.steps', str(steps), '--log-every', '5']
+
+
+def meta_arguments(dataset_path, base, out, steps):
+    arguments = ['--dataset', str(dataset_path), '--checkpoint', str(base), '--out', str(out)]
+    inner = ['--meta.inner-steps', '2', '--meta.batch-size', '16', '--log-every', '1']
+    return [*arguments, '--meta.outer-steps', str(steps), *inner]
+
+
+def weights(folder):
+    return load_checkpoint(folder).state_dict()
+
+
+def assert_same_bits(first, second):
+    assert first.keys() == second.keys()
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_pretrain_writes_checkpoint_logs_and_settings(base):
+    agent = load_checkpoint(base, environment='pointmaze-medium-v0')
+    assert agent.metadata['history'][0]['training']['steps'] == 20
+    lines = (base.parent / 'metrics.jsonl').read_text().splitlines()
+    assert [json.loads(line)['step'] for line in lines] == [5, 10, 15, 20]
+    assert all(np.isfinite(json.loads(line)['train/loss']) for line in lines)
+    assert json.loads((base.parent / 'settings.json').read_text())['settings']['seed'] == 0
+    assert list((base.parent / 'tensorboard').iterdir())
+
+
+def test_pretrain_does_not_overwrite_a_checkpoint(dataset_path, base, capsys):
+    with pytest.raises(SystemExit, match='2'):
+        pretrain.main(pretrain_arguments(dataset_path, base.parent, steps=20))
+    assert 'go on with --resume' in capsys.readouterr().err
+
+
+def test_resume_refuses_other_settings_by_name(dataset_path, base, capsys):
+    arguments = pretrain_arguments(dataset_path, base.parent, steps=20)
+    with pytest.raises(SystemExit, match='2'):
+        pretrain.main([*arguments, '--seed', '1', '--resume'])
+    assert 'seed was 0 and is now 1' in capsys.readouterr().err
+
+
+def test_missing_dataset_is_one_line(tmp_path, capsys):
+    with pytest.raises(SystemExit, match='2'):
+        pretrain.main(['--dataset', str(tmp_path / 'none.npz'), '--out', str(tmp_path)])
+    assert 'none.npz: no such file' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('algorithm', ['continual', 'fomaml', 'reptile'])
+def test_meta_train_changes_the_policy_and_keeps_its_history(
+    algorithm, dataset_path, base, tmp_path
+):
+    arguments = meta_arguments(dataset_path, base, tmp_path, steps=4)
+    meta_train.main([*arguments, '--meta.algorithm', algorithm, '--snapshot-every', '2'])
+    post_trained = load_checkpoint(tmp_path / 'checkpoint')
+    stages = [entry['stage'] for entry in post_trained.metadata['history']]
+    assert stages == ['pretrain', 'post_train']
+    changed = weights(tmp_path / 'checkpoint')
+    assert not all(torch.equal(changed[name], tensor) for name, tensor in weights(base).items())
+    assert_same_bits(changed, weights(tmp_path / 'snapshots' / '000004'))
+    last = json.loads((tmp_path / 'metrics.jsonl').read_text().splitlines()[-1])
+    assert last['step'] == 4
+    assert last['task/support_transitions'] > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGINT])
+def test_interrupted_run_resumes_to_the_same_bits(number, dataset_path, base, tmp_path):
+    steps = 60
+    straight, broken = tmp_path / 'straight', tmp_path / 'broken'
+    meta_train.main(meta_arguments(dataset_path, base, straight, steps))
+    arguments = [*meta_arguments(dataset_path, base, broken, steps), '--checkpoint-every', '3']
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'tools.meta_train', *arguments],
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    wait_for(lambda: (broken / 'checkpoint' / 'checkpoint.json').exists(), process)
+    os.kill(process.pid, number)
+    assert process.wait(30) in (-signal.SIGKILL, 130)
+    interrupted = json.loads((broken / 'checkpoint' / 'checkpoint.json').read_text())
+    assert 0 < interrupted['training']['step'] < steps
+    meta_train.main([*arguments, '--resume'])
+    assert_same_bits(weights(straight / 'checkpoint'), weights(broken / 'checkpoint'))
+    logged = [json.loads(line)['step'] for line in (broken / 'metrics.jsonl').open()]
+    assert logged == list(range(1, steps + 1))
+
+
+def wait_for(condition, process, timeout_s=60):
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert process.poll() is None, f'ended with status {process.returncode}'
+        assert time.monotonic() < deadline, f'nothing happened within {timeout_s} s'
+        time.sleep(0.01)
+
+
+@pytest.mark.mujoco
+@pytest.mark.slow
+def test_evaluate_writes_success_by_budget_and_seed(dataset_path, base, tmp_path, capsys):
+    out = tmp_path / 'evaluation.json'
+    arguments = ['--checkpoints', str(base), '--dataset', str(dataset_path), '--out', str(out)]
+    evaluate.main([*arguments, '--budgets', '0', '1', '--episodes', '1', '--seeds', '0', '1'])
+    (result,) = json.loads(out.read_text())['results']
+    assert [point['budget'] for point in result['curve']] == [0, 1]
+    for point in result['curve']:
+        assert len(point['per_seed']) == 2
+        assert sorted(point['per_task']) == ['1', '2', '3', '4', '5']
+        assert point['success'] == pytest.approx(np.mean(point['per_seed']))
+    assert '| K = 0 | K = 1 | AUC |' in capsys.readouterr().out
+
+
+def test_evaluate_table_shows_mean_error_and_auc():
+    curve = [
+        {'budget': 0, 'success': 0.25, 'standard_error': 0.0125},
+        {'budget': 10, 'success': 0.875, 'standard_error': 0.05},
+    ]
+    table = evaluate.format_table([{'checkpoint': 'meta', 'curve': curve, 'auc': 0.5625}])
+    assert table.splitlines()[-1] == '| meta | 0.25 ± 0.01 | 0.88 ± 0.05 | 0.562 |'
