@@ -135,6 +135,8 @@ def evaluate_success(
     if episodes < 1:
         raise ValueError(f'episodes must be at least 1, got {episodes}')
     task_ids = [task.task_id for task in simulator.tasks] if tasks is None else list(tasks)
+    if not task_ids:
+        raise ValueError('tasks must hold at least one task number, got none')
     if trajectory_filter is None and dataset is not None and ttt is not None and ttt.steps > 0:
         trajectory_filter = TrajectoryFilter(dataset)
     rates: dict[int, float] = {}

@@ -53,7 +53,7 @@ def normalized_auc(budgets: Sequence[float], success_rates: Sequence[float]) -> 
         raise ValueError(
             f'need two or more budgets with one rate each, got {x.shape} and {y.shape}'
         )
-    if x[0] < 0 or np.any(np.diff(x) <= 0):
+    if not (np.isfinite(x).all() and x[0] >= 0 and np.all(np.diff(x) > 0)):
         raise ValueError(f'budgets must ascend strictly from 0 or more, got {x.tolist()}')
     if not np.all((y >= 0) & (y <= 1)):
         raise ValueError(f'success rates must be in [0, 1], got {y.tolist()}')
