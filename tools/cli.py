@@ -40,7 +40,8 @@ def parse(
         description += (
             f'\n\n--preset NAME_OR_PATH starts from a preset: {", ".join(preset_names())}.'
         )
-        return tyro.cli(model, args=rest, default=model(**values), description=description)
+        default = model.model_validate(values)
+        return tyro.cli(model, args=rest, default=default, description=description)
     except ValidationError as error:
         fail(*error_lines(error))
     except ValueError as error:
@@ -54,6 +55,11 @@ def preset_values(name: str | None, section: str) -> dict[str, Any]:
     values = load_preset(name)
     if section not in values:
         raise ValueError(f'preset {name} has no section {section!r}; it has: {", ".join(values)}')
+    if not isinstance(values[section], dict):
+        raise ValueError(
+            f'preset {name}: {section} must hold a mapping of settings, '
+            f'got {type(values[section]).__name__}'
+        )
     return values[section]
 
 

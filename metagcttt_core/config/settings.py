@@ -22,10 +22,10 @@ class Settings(BaseModel):
             for key in values:
                 if key not in cls.model_fields:
                     close = get_close_matches(str(key), cls.model_fields, n=1)
-                    hint = f'did you mean {close[0]!r}?' if close else ''
+                    hint = f'; did you mean {close[0]!r}?' if close else ''
                     known = ', '.join(cls.model_fields)
                     raise ValueError(
-                        f'{cls.__name__} has no setting {key!r}; {hint} known: {known}'
+                        f'{cls.__name__} has no setting {key!r}{hint} (known: {known})'
                     )
         return values
 
