@@ -19,6 +19,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
 
 EVERY = QoSProfile(
     depth=5000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
@@ -37,6 +38,7 @@ class Graph:
         rclpy.init(context=self.context, domain_id=domain)
         self._executor = SingleThreadedExecutor(context=self.context)
         self._nodes: list[Node] = []
+        self._collecting: list[Subscription] = []
         self.node = self.add(Node)
 
     def add(self, make: Callable[..., AnyNode], **parameters: Any) -> AnyNode:
@@ -69,8 +71,16 @@ class Graph:
     def collect(self, message_type: type, topic: str, profile: QoSProfile = EVERY) -> list[Any]:
         """A list that grows by every message of a topic."""
         messages: list[Any] = []
-        self.node.create_subscription(message_type, topic, messages.append, profile)
+        self._collecting.append(
+            self.node.create_subscription(message_type, topic, messages.append, profile)
+        )
         return messages
+
+    def wait_for_publishers(self, timeout_s: float = 60.0) -> None:
+        """Wait until every topic that is collected has a publisher that reaches this process."""
+        for subscription in self._collecting:
+            what = f'a publisher of {subscription.topic_name}'
+            self.wait(subscription.get_publisher_count, what, timeout_s)
 
     def publish(self, topic: str, message: Any, profile: QoSProfile = RELIABLE) -> None:
         """Publish one message, once somebody listens."""

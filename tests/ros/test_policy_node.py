@@ -29,6 +29,10 @@ class Rig:
         self._states = graph.node.create_publisher(MazeState, 'state', EVERY)
         self._goals = graph.node.create_publisher(GoalQuery, 'goal', EVERY)
 
+    @property
+    def session(self):
+        return self.node._session
+
     def state(self, xy=ON_THE_WAY, step: int = 0, episode_id: int = 1, **flags) -> None:
         self._states.publish(
             MazeState(episode_id=episode_id, step=step, observation=list(xy), **flags)
@@ -38,6 +42,11 @@ class Rig:
         fields = {'active': True, **fields}
         self._goals.publish(
             GoalQuery(query_id=query_id, episode_id=episode_id, goal=list(goal), **fields)
+        )
+
+    def wait_until_adapting(self) -> None:
+        self.graph.wait(
+            lambda: self.session._query and self.session._query.adapting, 'an adaptation'
         )
 
     def report(self, query_id: int = 1):
@@ -106,7 +115,7 @@ def test_holding_policy_answers_with_the_expert_only(make_rig, slow_adaptation) 
     rig = make_rig(adaptation='hold')
     rig.state()
     rig.goal()
-    rig.graph.wait(lambda: rig.node._query, 'the goal')
+    rig.graph.wait(lambda: rig.session._query, 'the goal')
     slow_adaptation.set()
     action = rig.action()
     assert (action.query_id, action.adapted, len(rig.record.actions)) == (1, True, 1)
@@ -147,7 +156,9 @@ def test_newer_goal_cancels_the_adaptation_under_way(make_rig, slow_adaptation) 
     rig = make_rig(adaptation='hold')
     rig.state()
     rig.goal(1)
-    rig.graph.wait(lambda: rig.node._query and rig.node._query.adapting, 'the first adaptation')
+    rig.graph.wait(
+        lambda: rig.session._query and rig.session._query.adapting, 'the first adaptation'
+    )
     rig.goal(2)
     report = rig.report(1)
     assert (report.accepted, report.reason) == (
@@ -176,7 +187,7 @@ def test_goal_that_comes_before_its_episode_waits_for_it(make_rig) -> None:
     rig = make_rig(adaptation='hold')
     rig.state()
     rig.goal(episode_id=2)
-    rig.graph.wait(lambda: rig.node._query and rig.node._state, 'both')
+    rig.graph.wait(lambda: rig.session._query and rig.session._state, 'both')
     rig.state(episode_id=2)
     action = rig.action()
     assert (action.episode_id, action.adapted) == (2, True)
@@ -211,7 +222,7 @@ def test_failing_adaptation_is_reported_and_the_base_policy_acts(
 def test_lockstep_answers_every_state_exactly_once_and_only_with_a_goal(make_rig) -> None:
     rig = make_rig(adapt_steps=0)
     rig.state(step=5)
-    rig.graph.wait(lambda: rig.node._state, 'the state')
+    rig.graph.wait(lambda: rig.session._state, 'the state')
     rig.goal(1)
     assert rig.action().step == 5
     rig.goal(2)
@@ -220,7 +231,7 @@ def test_lockstep_answers_every_state_exactly_once_and_only_with_a_goal(make_rig
     rig.action_for(6)
     rig.goal(2, active=False)
     rig.state(step=7)
-    rig.graph.wait(lambda: rig.node._state.step == 7, 'the state without a goal')
+    rig.graph.wait(lambda: rig.session._state.step == 7, 'the state without a goal')
     rig.goal(3)
     rig.action_for(7)
     assert [a.step for a in rig.record.actions] == [5, 6, 7]
@@ -302,13 +313,13 @@ def test_lifecycle_through_its_services(make_rig) -> None:
     rig.state()
     rig.goal()
     assert change(rig, Transition.TRANSITION_CONFIGURE)
-    rig.graph.wait(lambda: rig.node._state and rig.node._query, 'state and goal')
+    rig.graph.wait(lambda: rig.session._state and rig.session._query, 'state and goal')
     assert rig.record.actions == []
     assert change(rig, Transition.TRANSITION_ACTIVATE)
     rig.action_for(0)
     assert change(rig, Transition.TRANSITION_DEACTIVATE)
     rig.state(step=1)
-    rig.graph.wait(lambda: rig.node._state.step == 1, 'the next state')
+    rig.graph.wait(lambda: rig.session._state.step == 1, 'the next state')
     assert len(rig.record.actions) == 1
     assert change(rig, Transition.TRANSITION_ACTIVATE)
     rig.action_for(1)
@@ -334,11 +345,11 @@ def test_deactivation_cancels_and_activation_adapts_again(make_rig, slow_adaptat
     rig = make_rig(adaptation='hold')
     rig.state()
     rig.goal()
-    rig.graph.wait(lambda: rig.node._query and rig.node._query.adapting, 'the adaptation')
+    rig.wait_until_adapting()
     assert change(rig, Transition.TRANSITION_DEACTIVATE)
     assert rig.record.actions == []
     slow_adaptation.set()
-    rig.graph.wait(lambda: not rig.node._query.adapting, 'the end of the adaptation')
+    rig.graph.wait(lambda: not rig.session._query.adapting, 'the end of the adaptation')
     assert change(rig, Transition.TRANSITION_ACTIVATE)
     assert rig.action().adapted
 
@@ -405,7 +416,7 @@ def test_adaptation_parameters_apply_to_the_next_query(make_rig) -> None:
     rig.goal(2)
     report = rig.report(2)
     assert (report.steps, len(report.test_losses)) == (5, 6)
-    config = rig.node._query.config
+    config = rig.session._query.config
     assert (config.lr, config.batch_size) == (0.01, 16)
 
 
@@ -440,4 +451,4 @@ def test_dataset_is_untouched_by_the_policy(make_rig, dataset_file: Path) -> Non
     rig.goal()
     rig.report()
     stored = TrajectoryDataset.load(dataset_file).observations
-    np.testing.assert_array_equal(rig.node._deployment.dataset.observations, stored)
+    np.testing.assert_array_equal(rig.session._deployment.dataset.observations, stored)

@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 import threading
 from typing import Generic, TypeVar
 
@@ -34,8 +35,7 @@ class AdaptationWorker(Generic[Key, Result]):
         self._pool = ThreadPoolExecutor(
             max_workers=1,
             thread_name_prefix='adaptation',
-            initializer=torch.set_num_threads if num_threads else None,
-            initargs=(num_threads,) if num_threads else (),
+            initializer=partial(torch.set_num_threads, num_threads) if num_threads else None,
         )
 
     def start(self, key: Key, job: Callable[[Callable[[], bool]], Result]) -> None:
