@@ -1,7 +1,7 @@
 # Every target does the set-up that it needs; `make help` lists them.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint clean
+.PHONY: help setup demo test assets lint clean
 
 PYTHON := .venv/bin/python
 ARGS ?=
@@ -25,6 +25,13 @@ demo: setup ## drive the real maze over ROS: three policies, five goals, a table
 
 test: setup ## run all tests; ARGS='-k filter' passes options to pytest
 	@$(RUN) $(PYTEST) -n $(WORKERS) $(ARGS)
+
+PRESET := --preset pointmaze-medium-navigate-cpu
+assets: setup ## train the demo's policies from scratch and pack assets/; going on where it ended
+	@$(PYTHON) -m tools.generate_data $(PRESET) --resume
+	@$(PYTHON) -m tools.pretrain $(PRESET) --resume
+	@$(PYTHON) -m tools.meta_train $(PRESET) --resume
+	@$(PYTHON) -m tools.pack_assets $(PRESET)
 
 lint: setup ## check style, formatting and types
 	@$(PYTHON) -m ruff check .
