@@ -25,12 +25,14 @@ from tools.runs import provenance
 
 _DESCRIPTION = """Drive the point maze over ROS 2: three policies, five goals.
 
+Example: make demo, or python -m tools.demo in a set-up checkout
 Starts sim_bridge_node, goal_node and policy_node as separate processes, publishes the five
 evaluation goals on `goal_pose` for each arm, prints a table and writes OUT/summary.json and
 OUT/demo.png."""
 
 _ENVIRONMENT = 'pointmaze-medium-v0'
 _ASSETS = 'pointmaze-medium-navigate'
+START_TIMEOUT_S = 30.0
 
 
 class DemoSettings(Settings):
@@ -82,12 +84,17 @@ def run_arms(settings: DemoSettings) -> dict[str, list[GoalOutcome]]:
             }
             log = logs / f'policy_node_{number}.log'
             with NodeProcess('policy_node', parameters, log) as policy:
-                client = MazeClient(lambda policy=policy: check([*nodes, policy]))
-                client.wait_until_ready()
-                outcomes[arm] = []
-                for task in range(1, num_tasks + 1):
-                    outcomes[arm].append(client.drive(task, settings.seed, settings.timeout_s))
-                    bar.update()
+                running = [*nodes, policy]
+                client = MazeClient(lambda running=running: check(running))
+                try:
+                    client.wait_until_ready(START_TIMEOUT_S)
+                    outcomes[arm] = []
+                    for task in range(1, num_tasks + 1):
+                        outcomes[arm].append(client.drive(task, settings.seed, settings.timeout_s))
+                        bar.update()
+                except NoAnswerError as error:
+                    logs_seen = (node.describe('still runs') for node in running)
+                    raise NoAnswerError('\n'.join([str(error), *logs_seen])) from error
                 client.destroy_node()
     return outcomes
 

@@ -1,0 +1,80 @@
+"""The demo over real processes, and how it fails."""
+
+import json
+import os
+from pathlib import Path
+import shutil
+import signal
+
+from metagcttt_core.config import assets_dir
+import pytest
+from tools import demo
+from tools.maze_client import MazeClient
+from tools.node_process import NodeFailedError, NodeProcess
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.mujoco]
+
+
+def processes_of_this_domain(executable):
+    """Process numbers of a node executable on our ROS domain."""
+    domain = f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]}'.encode()
+    found = []
+    for entry in Path('/proc').iterdir():
+        if entry.name.isdigit() and int(entry.name) != os.getpid():
+            try:
+                command = (entry / 'cmdline').read_bytes()
+                environment = (entry / 'environ').read_bytes().split(b'\0')
+            except OSError:  # it has ended meanwhile, or is not ours to look at
+                continue
+            if executable.encode() in command and domain in environment:
+                found.append(int(entry.name))
+    return found
+
+
+def test_all_goals_get_an_answer_and_results_are_written(tmp_path, capsys):
+    demo.main(['--out', str(tmp_path)])
+    summary = json.loads((tmp_path / 'summary.json').read_text())
+    arms = list(summary['arms'].values())
+    assert [len(goals) for goals in arms] == [5, 5, 5]
+    assert all(goal['transitions'] > 0 and goal['adaptation_ms'] > 0 for goal in arms[2])
+    reached = [sum(goal['success'] for goal in goals) for goals in arms]
+    assert reached[0] < reached[2]
+    assert (tmp_path / 'demo.png').stat().st_size > 20_000
+    assert '| meta + TTT (K = 10) |' in capsys.readouterr().out
+
+
+def test_a_node_that_dies_ends_the_demo_with_its_log(tmp_path, capsys, monkeypatch):
+    drive = MazeClient.drive
+
+    def drive_then_kill(self, task_id, seed, timeout_s):
+        outcome = drive(self, task_id, seed, timeout_s)
+        victims = processes_of_this_domain('policy_node')
+        assert victims
+        for victim in victims:
+            os.kill(victim, signal.SIGKILL)
+        return outcome
+
+    monkeypatch.setattr(MazeClient, 'drive', drive_then_kill)
+    with pytest.raises(SystemExit, match='2'):
+        demo.main(['--out', str(tmp_path)])
+    error = capsys.readouterr().err
+    assert 'policy_node ended with status -9' in error
+    assert 'trajectories' in error  # what the node had logged
+
+
+def test_a_node_that_cannot_configure_shows_its_reason(tmp_path, capsys, monkeypatch):
+    assets = tmp_path / 'assets'
+    shutil.copytree(assets_dir(), assets)
+    (assets / 'pointmaze-medium-navigate' / 'base' / 'checkpoint.json').write_text('{}')
+    monkeypatch.setenv('METAGCTTT_ASSETS', str(assets))
+    monkeypatch.setattr(demo, 'START_TIMEOUT_S', 15.0)
+    with pytest.raises(SystemExit, match='2'):
+        demo.main(['--out', str(tmp_path / 'out')])
+    assert 'not a checkpoint of this project' in capsys.readouterr().err
+
+
+def test_an_unknown_executable_ends_with_what_there_is(tmp_path):
+    with NodeProcess('pilot_node', {}, tmp_path / 'log') as node:
+        node._process.wait(10)
+        with pytest.raises(NodeFailedError, match="no executable 'pilot_node'; it has: goal_node"):
+            node.check()
