@@ -4,7 +4,13 @@ from pathlib import Path
 from metagcttt.goal_node import GoalNode
 from metagcttt.policy_node import PolicyNode
 from metagcttt.sim_bridge_node import SimBridgeNode
-from metagcttt_core import load_checkpoint, TrajectoryDataset, TrajectoryFilter, TTTConfig
+from metagcttt_core import (
+    FilterConfig,
+    load_checkpoint,
+    TrajectoryDataset,
+    TrajectoryFilter,
+    TTTConfig,
+)
 from metagcttt_core.evaluation.rollout import Episode, run_episode
 from metagcttt_interfaces.msg import EpisodeEvent, MazeState
 import numpy as np
@@ -37,7 +43,9 @@ def offline_episode(
             simulator,
             task_id,
             seed,
-            trajectory_filter=TrajectoryFilter(TrajectoryDataset.load(dataset)),
+            trajectory_filter=TrajectoryFilter(
+                TrajectoryDataset.load(dataset), FilterConfig(variant='gcttt')
+            ),
             ttt=config,
         )
 

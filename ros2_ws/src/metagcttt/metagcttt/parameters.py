@@ -108,7 +108,7 @@ POLICY_NODE = (
     ),
     Parameter(
         'adapt_batch_size',
-        1024,
+        256,
         'transitions per gradient step',
         minimum=1,
         maximum=10**6,
@@ -128,6 +128,13 @@ POLICY_NODE = (
         minimum=0,
         maximum=10**6,
         changes='now',
+    ),
+    Parameter(
+        'filter_variant',
+        'gcttt',
+        'rule that chooses the sub-trajectories to adapt on',
+        choices=('gcttt', 'paper'),
+        changes='configure',
     ),
     Parameter(
         'epsilon',

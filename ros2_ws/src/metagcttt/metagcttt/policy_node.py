@@ -42,7 +42,9 @@ class PolicyNode(LifecycleNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load policy and dataset, and connect; a failure leaves the node unconfigured."""
         config = FilterConfig(
-            epsilon=self._settings['epsilon'], top_percent=self._settings['top_percent']
+            variant=self._settings['filter_variant'],
+            epsilon=self._settings['epsilon'],
+            top_percent=self._settings['top_percent'],
         )
         try:
             deployment = load_deployment(
