@@ -23,6 +23,16 @@ def test_old_content_stays_until_the_end(tmp_path):
         assert path.read_bytes() == b'old'
 
 
+def test_reader_of_the_old_content_is_not_disturbed(tmp_path):
+    path = tmp_path / 'file'
+    path.write_bytes(b'old')
+    with path.open('rb') as reader:
+        with atomic_write(path) as file:
+            file.write(b'new')
+        assert reader.read() == b'old'
+    assert path.read_bytes() == b'new'
+
+
 @pytest.mark.parametrize('error', [ValueError, KeyboardInterrupt, SystemExit])
 def test_failing_block_leaves_the_old_content_and_nothing_else(error, tmp_path):
     path = tmp_path / 'file'

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 import math
 
-from hypothesis import given, HealthCheck, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from metagcttt_core import FilterConfig, SupportSet, TrajectoryDataset, TrajectoryFilter
 import numpy as np
@@ -14,7 +14,7 @@ from tests.core.builders import DATA, dataset_at, terminals_of
 from tests.core.retrieval import reference
 from tests.core.retrieval.reference import Answer
 
-SLOW_EXAMPLES = settings(max_examples=200, suppress_health_check=[HealthCheck.too_slow])
+MANY_EXAMPLES = settings(max_examples=200)
 
 
 @dataclass
@@ -100,7 +100,7 @@ def assert_answers(support: SupportSet, answer: Answer, dataset: TrajectoryDatas
 
 
 @pytest.mark.parametrize('critic', [False, True])
-@SLOW_EXAMPLES
+@MANY_EXAMPLES
 @given(problem=problems())
 def test_paper_equals_the_reference(problem, critic):
     config = problem.config('paper')
@@ -112,7 +112,7 @@ def test_paper_equals_the_reference(problem, critic):
     assert not problem.dataset.terminals[support.indices].any()
 
 
-@SLOW_EXAMPLES
+@MANY_EXAMPLES
 @given(problem=problems())
 def test_critic_free_gcttt_equals_the_reference(problem):
     config = problem.config('gcttt')
@@ -120,7 +120,7 @@ def test_critic_free_gcttt_equals_the_reference(problem):
     assert_answers(problem.query(config, critic=False), expected, problem.dataset)
 
 
-@SLOW_EXAMPLES
+@MANY_EXAMPLES
 @given(problem=problems())
 def test_critic_based_gcttt_equals_the_reference(problem):
     config = problem.config('gcttt')
