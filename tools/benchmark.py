@@ -1,14 +1,17 @@
 """Measure speed against a baseline in the same run; prints a table, writes JSON."""
 
+from collections.abc import Callable
+
 import tyro
 
+from tools.benchmarks.report import Benchmark
 from tools.benchmarks.retrieval import RetrievalBenchmark
 
 _DESCRIPTION = """Measure speed against a baseline in the same run.
 
 Example: python -m tools.benchmark retrieval"""
 
-BENCHMARKS = {'retrieval': RetrievalBenchmark}
+BENCHMARKS: dict[str, Callable[..., Benchmark]] = {'retrieval': RetrievalBenchmark}
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager, ExitStack
+from functools import partial
 import json
 import os
 from pathlib import Path
@@ -76,8 +77,8 @@ def run_arms(settings: DemoSettings) -> dict[str, list[GoalOutcome]]:
         stack.callback(rclpy.try_shutdown)
         bar = stack.enter_context(tqdm(total=len(arms) * num_tasks, unit='goal', desc='demo'))
         for number, (arm, (checkpoint, steps)) in enumerate(arms.items()):
-            parameters = {
-                'checkpoint': assets_dir() / _ASSETS / checkpoint,
+            parameters: dict[str, bool | int | float | str] = {
+                'checkpoint': str(assets_dir() / _ASSETS / checkpoint),
                 'adapt_steps': steps,
                 'stepping': 'lockstep',
                 'adaptation': 'hold',
@@ -85,7 +86,7 @@ def run_arms(settings: DemoSettings) -> dict[str, list[GoalOutcome]]:
             log = logs / f'policy_node_{number}.log'
             with NodeProcess('policy_node', parameters, log) as policy:
                 running = [*nodes, policy]
-                client = MazeClient(lambda running=running: check(running))
+                client = MazeClient(partial(check, running))
                 try:
                     client.wait_until_ready(START_TIMEOUT_S)
                     outcomes[arm] = []

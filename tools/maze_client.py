@@ -97,7 +97,7 @@ class MazeClient(Node):
         self.wait(self._set_task.service_is_ready, 'service set_task', timeout_s)
         for topic, needed in (('goal_pose', 1), ('action', 1), ('goal', 1)):
             self.wait(
-                lambda topic=topic, needed=needed: self.count_subscribers(topic) >= needed,
+                partial(self._has_subscribers, topic, needed),
                 f'a subscriber of {topic}',
                 timeout_s,
             )
@@ -117,8 +117,9 @@ class MazeClient(Node):
             raise NoAnswerError(f'set_task {task_id} was refused: {answer.message}')
         accepted = self._publish_goal(answer, timeout_s)
         ends = (EpisodeEvent.REACHED, EpisodeEvent.TIMED_OUT)
-        self.wait(lambda: self._event(accepted.query_id, ends) is not None, 'the goal', timeout_s)
-        end = self._event(accepted.query_id, ends)
+        find_end = partial(self._events_of, accepted.query_id, ends)
+        self.wait(lambda: bool(find_end()), 'the goal', timeout_s)
+        end = find_end()[0]
         self.wait(
             lambda: any(report.query_id == accepted.query_id for report in self._seen.reports),
             'the adaptation report',
@@ -149,9 +150,8 @@ class MazeClient(Node):
             pose.pose.orientation.w = 1.0
             known = len(self._seen.events)
             self._goal_pose.publish(pose)
-            answers = partial(self._answers, known)
-            self.wait(lambda answers=answers: bool(answers()), 'goal_pose', timeout_s)
-            event = answers()[0]
+            self.wait(partial(self._is_answered, known), 'goal_pose', timeout_s)
+            event = self._answers(known)[0]
             if event.kind == EpisodeEvent.GOAL_REJECTED:
                 raise NoAnswerError(f'the goal was rejected: {event.reason}')
             if event.episode_id == task.episode_id:
@@ -167,6 +167,11 @@ class MazeClient(Node):
         kinds = (EpisodeEvent.GOAL_ACCEPTED, EpisodeEvent.GOAL_REJECTED)
         return [event for event in self._seen.events[known:] if event.kind in kinds]
 
-    def _event(self, query_id: int, kinds: tuple[int, ...]) -> EpisodeEvent | None:
-        found = [e for e in self._seen.events if e.query_id == query_id and e.kind in kinds]
-        return found[0] if found else None
+    def _is_answered(self, known: int) -> bool:
+        return bool(self._answers(known))
+
+    def _has_subscribers(self, topic: str, needed: int) -> bool:
+        return self.count_subscribers(topic) >= needed
+
+    def _events_of(self, query_id: int, kinds: tuple[int, ...]) -> list[EpisodeEvent]:
+        return [e for e in self._seen.events if e.query_id == query_id and e.kind in kinds]

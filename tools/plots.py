@@ -28,7 +28,7 @@ def draw_maze(axes: Axes, maze: MazeMap) -> None:
 def draw_segments(axes: Axes, segments: Sequence[np.ndarray]) -> None:
     """Retrieved sub-trajectories, each (n, 2) in metres, as thin grey lines."""
     axes.add_collection(
-        LineCollection(list(segments), colors=_RETRIEVED, linewidths=0.5, alpha=0.5)
+        LineCollection(list(segments), colors=_RETRIEVED, linewidths=0.9, alpha=0.8)
     )
 
 

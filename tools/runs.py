@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib.metadata import version
 import json
 from pathlib import Path
@@ -12,8 +13,14 @@ import time
 from typing import Any, Self
 
 from metagcttt_core.config import Settings
+from metagcttt_core.training.checkpoint import has_checkpoint, load_training_state
+from metagcttt_core.training.run import TrainingInterrupted, TrainingRun
+from pydantic import Field
 import torch
 from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from tools.cli import fail
 
 _PACKAGES = ('torch', 'numpy', 'mujoco', 'ogbench')
 
@@ -53,6 +60,77 @@ class RunLog:
     def __exit__(self, *_: object) -> None:
         """Close."""
         self.close()
+
+
+class RunSettings(Settings):
+    """Settings that the training tools share."""
+
+    dataset: Path = Field(
+        Path('data/pointmaze-medium-navigate-v0.npz'), description='offline dataset (npz)'
+    )
+    out: Path = Field(Path('out/run'), description='folder of the run')
+    seed: int = Field(0, ge=0, description='of everything random')
+    checkpoint_every: int = Field(1000, ge=1, description='steps between checkpoints')
+    log_every: int = Field(100, ge=1, description='steps between log lines')
+    threads: int = Field(1, ge=1, description='threads for tensor operations')
+    resume: bool = Field(False, description='go on from the checkpoint in OUT, if there is one')
+
+    @property
+    def checkpoint_folder(self) -> Path:
+        """Where the run's checkpoint is."""
+        return self.out / 'checkpoint'
+
+
+@dataclass(frozen=True)
+class Session:
+    """A run in progress: its checkpoints, logs and progress bar."""
+
+    run: TrainingRun
+    log: RunLog
+    bar: tqdm
+
+
+@contextmanager
+def training_session(
+    settings: RunSettings, stage: str, decisive: dict[str, Any], steps: int
+) -> Iterator[Session]:
+    """Logs, checkpoints and a clean end for a training tool.
+
+    Args:
+        settings: The tool's settings.
+        stage: `pretrain` or `post_train`.
+        decisive: Everything that decides the result; see `TrainingRun`.
+        steps: Number of steps of the whole run.
+
+    Raises:
+        SystemExit: With status 130 after Ctrl-C or SIGTERM, everything done so far being saved.
+    """
+    folder = settings.checkpoint_folder
+    exists = has_checkpoint(folder)
+    if exists and not settings.resume:
+        fail(f'{folder} holds a checkpoint: go on with --resume, or choose another --out')
+    write_settings(settings.out, settings)
+    first = load_training_state(folder).step if exists else 0
+    with (
+        stop_on_signal() as stop,
+        RunLog(settings.out, first) as log,
+        tqdm(total=steps, initial=first, unit='step', desc=stage) as bar,
+    ):
+        run = TrainingRun(
+            stage,
+            decisive,
+            folder,
+            every=settings.checkpoint_every,
+            resume=settings.resume,
+            should_stop=stop.is_set,
+        )
+        try:
+            yield Session(run, log, bar)
+        except TrainingInterrupted as interruption:
+            bar.close()
+            print(f'{interruption}; go on with --resume')
+            raise SystemExit(130) from interruption
+    print(f'policy: {folder}')
 
 
 @contextmanager

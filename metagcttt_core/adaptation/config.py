@@ -1,4 +1,4 @@
-"""Settings of test-time training."""
+"""Settings of the inner loop, at test time and in meta-post-training."""
 
 from typing import Literal
 
@@ -8,17 +8,12 @@ from metagcttt_core.config.settings import Settings
 from metagcttt_core.training.optimizers import OptimizerName
 
 
-class TTTConfig(Settings):
-    """K gradient steps on the support set of a query (paper, section 3.2)."""
+class InnerLoopConfig(Settings):
+    """What test-time training and the inner loop of post-training have in common."""
 
-    steps: int = Field(10, ge=0, description='gradient steps K; 0 acts with the base policy')
-    lr: float = Field(3e-4, gt=0, description='inner learning rate alpha')
-    batch_size: int = Field(1024, ge=1, description='transitions per step')
+    batch_size: int = Field(1024, ge=1, description='transitions per inner step')
     optimizer: OptimizerName = Field('adam', description='inner optimiser')
-    optimizer_state: Literal['fresh', 'pretrained'] = Field(
-        'fresh', description='Adam moments and step count to begin with'
-    )
-    early_stopping: bool = Field(False, description='hold out a test split and keep the best step')
+    early_stopping: bool = Field(True, description='use the inner step of lowest held-out loss')
     test_fraction: float = Field(0.2, gt=0, lt=1, description='share of the support held out')
     max_test: int = Field(128, ge=1, description='most transitions in the test split')
     actor_only: bool = Field(False, description='update the actor and leave the critic')
@@ -28,6 +23,17 @@ class TTTConfig(Settings):
     ratio: float = Field(
         1.0, ge=0, le=1, description='share of a batch from the support, the rest from all data'
     )
+
+
+class TTTConfig(InnerLoopConfig):
+    """K gradient steps on the support set of a query (paper, section 3.2)."""
+
+    steps: int = Field(10, ge=0, description='gradient steps K; 0 acts with the base policy')
+    lr: float = Field(3e-4, gt=0, description='inner learning rate alpha')
+    optimizer_state: Literal['fresh', 'pretrained'] = Field(
+        'fresh', description='Adam moments and step count to begin with'
+    )
+    early_stopping: bool = Field(False, description='hold out a test split and keep the best step')
     horizon: int | None = Field(
         None, ge=1, description='environment steps after which to adapt again; never by default'
     )

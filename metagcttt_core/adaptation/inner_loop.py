@@ -68,10 +68,10 @@ def run_inner_loop(
     test_losses: list[float] = []
     best_step, best_loss, best_weights = 0, float('inf'), None
 
-    def test(step: int) -> None:
+    def test(step: int, batch: TensorBatch) -> None:
         nonlocal best_step, best_loss, best_weights
         with torch.no_grad():
-            loss = agent.losses(test_batch, actor_only=actor_only)[0].item()
+            loss = agent.losses(batch, actor_only=actor_only)[0].item()
         test_losses.append(loss)
         rank = loss if math.isfinite(loss) else math.inf
         if step == 0 or rank < best_loss:
@@ -80,14 +80,14 @@ def run_inner_loop(
 
     step = 0
     if test_batch is not None:
-        test(step)
+        test(step, test_batch)
     for step, batch in enumerate(batches, start=1):
         if should_stop is not None and should_stop():
             raise AdaptationCancelled(f'cancelled before inner step {step}')
         loss, _ = gradient_step(agent, stepper, parameters, batch, actor_only=actor_only)
         train_losses.append(loss)
         if test_batch is not None:
-            test(step)
+            test(step, test_batch)
 
     stepper.zero_grad()
     if best_weights is not None:

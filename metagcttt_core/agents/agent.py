@@ -65,7 +65,7 @@ class Agent(nn.Module, ABC):
             generator=generator,
         )
         if not settings.const_std:
-            self.actor.log_stds = nn.Parameter(torch.zeros(act_dim))
+            self.actor.register_parameter('log_stds', nn.Parameter(torch.zeros(act_dim)))
 
     @abstractmethod
     def losses(
@@ -103,8 +103,11 @@ class Agent(nn.Module, ABC):
         error = actions - mean
         if self.settings.const_std:
             return (-0.5 * error.square() - _HALF_LOG_TWO_PI).sum(-1), mean
-        log_std = self.actor.log_stds.clamp(-5, 2)
+        log_std = self._log_std()
         return (-0.5 * (error / log_std.exp()).square() - log_std - _HALF_LOG_TWO_PI).sum(-1), mean
+
+    def _log_std(self) -> Tensor:
+        return self.actor.get_parameter('log_stds').clamp(-5, 2)
 
     @torch.inference_mode()
     def act(
@@ -142,11 +145,7 @@ class Agent(nn.Module, ABC):
         if temperature > 0:
             if rng is None:
                 raise ValueError('acting with a temperature above 0 needs an rng')
-            std = (
-                1.0
-                if self.settings.const_std
-                else self.actor.log_stds.clamp(-5, 2).exp().cpu().numpy()
-            )
+            std = 1.0 if self.settings.const_std else self._log_std().exp().cpu().numpy()
             mean = mean + temperature * std * rng.standard_normal(mean.shape, dtype=np.float32)
         return np.clip(mean, -1, 1)
 

@@ -125,7 +125,7 @@ class GCIQL(Agent):
     def _value_digest(self) -> bytes:
         digest = hashlib.blake2b(digest_size=16)
         for weight in self.value.parameters():
-            digest.update(weight.detach().cpu().numpy())
+            digest.update(weight.detach().cpu().numpy().data)
         return digest.digest()
 
 

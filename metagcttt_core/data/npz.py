@@ -66,7 +66,7 @@ def read_arrays(
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Write a compressed npz file; `path` holds the old content or the new, never a part."""
     with atomic_write(path) as file:
-        np.savez_compressed(file, **arrays)
+        np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
 def _read(path: Path, name: str, source: Path | IO[bytes]) -> np.ndarray:

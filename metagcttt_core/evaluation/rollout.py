@@ -73,17 +73,18 @@ def run_episode(
         ttt: Test-time training; by default the base policy acts as it is. With `horizon`, the base
             weights are adapted again to the current state every that many steps.
     """
-    adapting = ttt is not None and ttt.steps > 0
-    if adapting and trajectory_filter is None:
+    ttt = ttt or TTTConfig(steps=0)
+    if ttt.steps > 0 and trajectory_filter is None:
         raise ValueError('test-time training needs a dataset or a trajectory filter')
     observation, goal = simulator.reset(task_id=task_id, seed=seed)
-    observations, actions = [observation], []
-    supports, adaptations = [], []
+    observations: list[np.ndarray] = [observation]
+    actions: list[np.ndarray] = []
+    supports: list[SupportSet] = []
+    adaptations: list[Adaptation] = []
     expert = agent
     finished = False
     while not finished:
-        step = len(actions)
-        if adapting and (step == 0 or (ttt.horizon and step % ttt.horizon == 0)):
+        if trajectory_filter is not None and _adaptation_is_due(ttt, step=len(actions)):
             supports.append(trajectory_filter.query(observation, goal, agent.value_fn))
             adaptations.append(
                 adapt(agent, trajectory_filter.dataset, supports[-1], goal, ttt, seed=seed)
@@ -103,6 +104,12 @@ def run_episode(
         supports=supports,
         adaptations=adaptations,
     )
+
+
+def _adaptation_is_due(ttt: TTTConfig, step: int) -> bool:
+    if ttt.steps == 0:
+        return False
+    return step % ttt.horizon == 0 if ttt.horizon else step == 0
 
 
 def evaluate_success(

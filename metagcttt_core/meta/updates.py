@@ -59,14 +59,15 @@ def fomaml(
     if optimizer is None:
         raise ValueError('fomaml needs an outer optimizer')
     parameters = list(base.trained_parameters(actor_only=config.actor_only))
-    for parameter in parameters:
-        parameter.grad = torch.zeros_like(parameter)
+    means = [torch.zeros_like(parameter) for parameter in parameters]
     for expert in experts:
         adapted = list(expert.result.agent.trained_parameters(actor_only=config.actor_only))
         loss, _ = expert.result.agent.losses(expert.test_batch, actor_only=config.actor_only)
         gradients = torch.autograd.grad(loss, adapted)
-        for parameter, gradient in zip(parameters, gradients, strict=True):
-            parameter.grad += gradient / len(experts)
+        for mean, gradient in zip(means, gradients, strict=True):
+            mean += gradient / len(experts)
+    for parameter, mean in zip(parameters, means, strict=True):
+        parameter.grad = mean
     optimizer.step()
 
 

@@ -47,7 +47,8 @@ def open_index(dataset: TrajectoryDataset, config: FilterConfig, path: Path) -> 
     index = SpatialIndex(*parameters)
     try:
         with atomic_write(path) as file:
-            np.savez(file, fingerprint=np.frombuffer(fingerprint, np.uint8), **index.arrays())
+            kept = {'fingerprint': np.frombuffer(fingerprint, np.uint8), **index.arrays()}
+            np.savez(file, allow_pickle=False, **kept)
     except OSError as error:
         _log.warning('the index cannot be kept in %s: %s', path, error)
     return index
@@ -58,5 +59,5 @@ def _fingerprint(dataset: TrajectoryDataset, config: FilterConfig) -> bytes:
     settings = (_FORMAT, config.position_dims, config.scale, config.cell_size, dataset.num_rows)
     digest = hashlib.blake2b(repr(settings).encode(), digest_size=16)
     for dim in config.position_dims[:2]:
-        digest.update(np.ascontiguousarray(dataset.observations[:, dim]))
+        digest.update(np.ascontiguousarray(dataset.observations[:, dim]).data)
     return digest.digest()

@@ -119,7 +119,12 @@ def _closest_to_goal(task: Task, episodes: np.ndarray, starts: np.ndarray) -> Be
 def _highest_value(task: Task, episodes: np.ndarray, starts: np.ndarray) -> Best:
     """Per trajectory the state of highest V from its start on, as the smallest of -V."""
     rows = _ranges(starts, task.dataset.episode_ends[episodes] + 1)
-    return smallest_per_episode(task.dataset.episode_of(rows), rows, -task.value(rows))
+    return smallest_per_episode(task.dataset.episode_of(rows), rows, -_values(task, rows))
+
+
+def _values(task: Task, rows: np.ndarray) -> np.ndarray:
+    assert task.value is not None, 'only the critic-based rules ask for values'
+    return task.value(rows)
 
 
 def _best(scores: np.ndarray, config: FilterConfig) -> np.ndarray:
@@ -138,7 +143,7 @@ def _gcttt_by_steps(task: Task, config: FilterConfig) -> Candidates:
     near_g = np.sort(task.near_goal(strict=True).rows)
     near_g = near_g[data.episode_starts[data.episode_of(near_g)] != near_g]  # never a first row
     episodes = data.episode_of(near_s)
-    num_relevant = np.count_nonzero(np.diff(episodes, prepend=-1))
+    num_relevant = int(np.count_nonzero(np.diff(episodes, prepend=-1)))
     if not len(near_g):
         near_s, episodes = near_s[:0], episodes[:0]
     slot = np.searchsorted(near_g, near_s)
@@ -166,7 +171,7 @@ def _gcttt_by_value(task: Task, config: FilterConfig) -> Candidates:
     eligible = firsts + config.min_steps <= data.episode_ends[relevant]
     episodes, firsts = relevant[eligible], firsts[eligible]
     rows = _ranges(firsts + config.min_steps, data.episode_ends[episodes] + 1)
-    inside = 1 + (1 - _GCTTT_DISCOUNT) * task.value(rows).astype(np.float64)
+    inside = 1 + (1 - _GCTTT_DISCOUNT) * _values(task, rows).astype(np.float64)
     steps = np.log(np.where(inside > 0, inside, 1)) / np.log(_GCTTT_DISCOUNT)
     distances = np.where(inside > 0, steps, np.finfo(np.float64).max)  # V below -100: far away
     best = smallest_per_episode(data.episode_of(rows), rows, distances)

@@ -1,6 +1,6 @@
 """The optimisers by name."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 import copy
 from functools import partial
 from typing import Any, Literal
@@ -12,7 +12,10 @@ OptimizerName = Literal['adam', 'sgd']
 
 # Fused: one kernel over all parameters. Torch's Adam adds eps after bias correction, as optax
 # does.
-_OPTIMIZERS = {'adam': partial(torch.optim.Adam, fused=True), 'sgd': torch.optim.SGD}
+_OPTIMIZERS: dict[str, Callable[..., torch.optim.Optimizer]] = {
+    'adam': partial(torch.optim.Adam, fused=True),
+    'sgd': torch.optim.SGD,
+}
 
 
 def make_optimizer(
@@ -35,8 +38,4 @@ def make_optimizer(
     if state is not None:
         # Torch keeps the very tensors it is given and steps them in place.
         optimizer.load_state_dict({**optimizer.state_dict(), 'state': copy.deepcopy(state)})
-    # The fused kernels change weights without counting it, and value functions rely on the count.
-    optimizer.register_step_post_hook(
-        lambda *_: torch.autograd.graph.increment_version(parameters)
-    )
     return optimizer

@@ -1,5 +1,6 @@
 """How benchmark results are shown and kept."""
 
+from abc import ABC, abstractmethod
 import json
 import os
 from pathlib import Path
@@ -10,6 +11,14 @@ from metagcttt_core.config import Settings
 from metagcttt_core.files import atomic_write
 
 from tools.runs import provenance
+
+
+class Benchmark(Settings, ABC):
+    """Settings of a benchmark."""
+
+    @abstractmethod
+    def run(self) -> None:
+        """Measure, print a table and write JSON."""
 
 
 def markdown_table(rows: list[dict[str, Any]]) -> str:

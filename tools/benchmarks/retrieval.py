@@ -6,8 +6,8 @@ import time
 from typing import Any
 
 from matplotlib.figure import Figure
-from metagcttt_core import make_agent, TrajectoryDataset, TrajectoryFilter
-from metagcttt_core.config import Settings
+from metagcttt_core import TrajectoryDataset, TrajectoryFilter
+from metagcttt_core.agents.gciql import GCIQL, GCIQLSettings
 import numpy as np
 from pydantic import Field
 from sim_bridge.behaviours import Kind
@@ -16,7 +16,7 @@ from sim_bridge.plan import plan_dataset
 import torch
 from tqdm import tqdm
 
-from tools.benchmarks.report import markdown_table, write_report
+from tools.benchmarks.report import Benchmark, markdown_table, write_report
 from tools.benchmarks.scan import scan
 from tools.plots import COLORS, save
 
@@ -24,7 +24,7 @@ _ENVIRONMENT = 'pointmaze-medium-v0'
 _JITTER_M = 0.05
 
 
-class RetrievalBenchmark(Settings):
+class RetrievalBenchmark(Benchmark):
     """Filter cost on point maze data of OGBench's size (kept in DATA) and ten times it."""
 
     data: Path = Field(Path('data'), description='folder of the generated datasets')
@@ -62,8 +62,13 @@ class RetrievalBenchmark(Settings):
         plan = plan_dataset(_ENVIRONMENT, kind)
         path = self.data / f'pointmaze-medium-{kind}-v0.npz'
         if not path.with_suffix('.json').exists():
-            with tqdm(total=plan.episodes, unit='episode', desc=f'generate {kind}') as bar:
-                generate(plan, path, processes=2, resume=True, progress=bar.update)
+            with tqdm(unit='episode', desc=f'generate {kind}') as bar:
+
+                def progress(done: int, total: int) -> None:
+                    bar.total = total
+                    bar.update(done - bar.n)
+
+                generate(plan, path, processes=2, resume=True, progress=progress)
         return TrajectoryDataset.load(path)
 
     def _tasks(self, dataset: TrajectoryDataset, count: int) -> np.ndarray:
@@ -71,12 +76,12 @@ class RetrievalBenchmark(Settings):
         return dataset.observations[rng.integers(dataset.num_rows, size=(count, 2))]
 
     def _critic_free(self, name: str, dataset: TrajectoryDataset) -> dict[str, Any]:
-        trajectory_filter, build_s = timed(lambda: TrajectoryFilter(dataset))
+        trajectory_filter, build_s = timed(TrajectoryFilter, dataset)
         tasks = self._tasks(dataset, self.queries)
         trajectory_filter.query(*tasks[0])  # pages in what the first query alone would pay for
-        found = [timed(lambda task=task: trajectory_filter.query(*task)) for task in tasks]
+        found = [timed(trajectory_filter.query, *task) for task in tasks]
         # The scan is slow and varies little: a tenth of the queries is enough.
-        scanned = [timed(lambda task=task: scan(dataset, *task)) for task in tasks[::10]]
+        scanned = [timed(scan, dataset, *task) for task in tasks[::10]]
         for (support, _), (rows, _) in zip(found[::10], scanned, strict=True):
             if not np.array_equal(support.indices, rows):
                 raise AssertionError(f'{name}: index and scan select different rows')
@@ -95,26 +100,22 @@ class RetrievalBenchmark(Settings):
 
     def _critic_based(self, name: str, dataset: TrajectoryDataset) -> dict[str, Any]:
         """First query of a goal, the same again, and other places after a prefetch."""
-        agent = make_agent(
-            'gciql',
-            obs_dim=dataset.obs_dim,
-            act_dim=dataset.act_dim,
-            hidden=self.hidden,
-            seed=self.seed,
+        agent = GCIQL(
+            dataset.obs_dim,
+            dataset.act_dim,
+            GCIQLSettings(hidden=self.hidden),
+            torch.Generator().manual_seed(self.seed),
         )
         value_fn = agent.value_fn
         trajectory_filter = TrajectoryFilter(dataset)
-        _, everywhere_s = timed(lambda: in_batches(value_fn, dataset, dataset.observations[0]))
+        _, everywhere_s = timed(in_batches, value_fn, dataset, dataset.observations[0])
         cold, again, warm = [], [], []
         places = self._tasks(dataset, 20)[:, 0]
         for state, goal in self._tasks(dataset, self.goals):
-            cold.append(timed(lambda s=state, g=goal: trajectory_filter.query(s, g, value_fn))[1])
-            again.append(timed(lambda s=state, g=goal: trajectory_filter.query(s, g, value_fn))[1])
+            cold.append(timed(trajectory_filter.query, state, goal, value_fn)[1])
+            again.append(timed(trajectory_filter.query, state, goal, value_fn)[1])
             trajectory_filter.prefetch_values(value_fn, goal)
-            warm += [
-                timed(lambda s=place, g=goal: trajectory_filter.query(s, g, value_fn))[1]
-                for place in places
-            ]
+            warm += [timed(trajectory_filter.query, place, goal, value_fn)[1] for place in places]
         return {
             'dataset': name,
             'V everywhere': 1e3 * everywhere_s,
@@ -126,10 +127,10 @@ class RetrievalBenchmark(Settings):
         }
 
 
-def timed(call: Callable[[], Any]) -> tuple[Any, float]:
-    """What `call` returns and the seconds it took."""
+def timed(call: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
+    """What `call` returns for `arguments` and the seconds it took."""
     began = time.perf_counter()
-    result = call()
+    result = call(*arguments)
     return result, time.perf_counter() - began
 
 
