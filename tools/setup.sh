@@ -107,7 +107,10 @@ install_packages() {
 
 build_workspace() {
   local log=$workspace/log/setup.log
+  # Left by a build that did not end: what it wrote may be half a file.
+  [ ! -f "$stamps/building" ] || rm -rf "$workspace"/{build,install,log}
   rm -f "$stamps/workspace"
+  touch "$stamps/building"
   mkdir -p "$workspace/log"
   say 'building the ROS workspace'
   [ "$ros" = system ] || export AMENT_PREFIX_PATH=$venv CMAKE_PREFIX_PATH=$venv
@@ -119,6 +122,7 @@ build_workspace() {
   }
   [ "$ros" = system ] || link_workspace
   workspace_digest >"$stamps/workspace"
+  rm "$stamps/building"
 }
 
 # Make the workspace visible to .venv/bin/python with nothing sourced. The ROS wheels add every
