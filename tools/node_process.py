@@ -24,6 +24,7 @@ class NodeProcess:
         parameters: Mapping[str, bool | int | float | str],
         log: Path,
         environment: Mapping[str, str] | None = None,
+        remappings: Mapping[str, str] | None = None,
     ) -> None:
         """Start it.
 
@@ -32,6 +33,7 @@ class NodeProcess:
             parameters: ROS parameters by name.
             log: File for what it prints.
             environment: Environment variables besides those of this process.
+            remappings: Names to replace, such as `/clock`; `__ns` sets the namespace.
         """
         self.executable = executable
         self.log = log
@@ -39,6 +41,8 @@ class NodeProcess:
         for name, value in parameters.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             command += ['-p', f'{name}:={text}']
+        for name, other in (remappings or {}).items():
+            command += ['-r', f'{name}:={other}']
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open('wb') as output:
             self._process = subprocess.Popen(
@@ -75,6 +79,12 @@ class NodeProcess:
             except subprocess.TimeoutExpired:
                 continue
         raise NodeFailedError(self.describe('cannot be killed'))
+
+    def kill(self) -> None:
+        """End it at once, as a crash would."""
+        if self._process.poll() is None:
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
 
     def __enter__(self) -> Self:
         """The running process."""

@@ -25,7 +25,7 @@ setup(
     entry_points={
         'console_scripts': [
             f'{node} = {NAME}.main:{node}'
-            for node in ('goal_node', 'policy_node', 'sim_bridge_node')
+            for node in ('goal_node', 'policy_node', 'recorder_node', 'sim_bridge_node')
         ]
     },
 )

@@ -19,6 +19,14 @@ def policy_node() -> int:
     return run(PolicyNode, stop)
 
 
+def recorder_node() -> int:
+    """Run the recorder until Ctrl-C or SIGTERM; returns the exit code."""
+    stop = stop_on_signals()
+    from metagcttt.recorder_node import RecorderNode
+
+    return run(RecorderNode, stop)
+
+
 def sim_bridge_node() -> int:
     """Run the simulator's bridge until Ctrl-C or SIGTERM; returns the exit code."""
     stop = stop_on_signals()

@@ -178,8 +178,29 @@ POLICY_NODE = (
     ),
 )
 
+RECORDER_NODE = (
+    Parameter(
+        'output', '', 'file to write (.mcap), which must not exist; empty: rec-DATE-TIME.mcap here'
+    ),
+    Parameter(
+        'split_mb',
+        0.0,
+        'begin another file when one is this large, megabytes; 0: never',
+        minimum=0,
+        maximum=1000000,
+    ),
+    Parameter(
+        'flush_s',
+        1.0,
+        'how often what was recorded goes to the file, seconds; a killed recorder loses no more',
+        minimum=0.01,
+        maximum=3600,
+    ),
+)
+
 TABLES = {
     'goal_node': GOAL_NODE,
     'policy_node': POLICY_NODE,
+    'recorder_node': RECORDER_NODE,
     'sim_bridge_node': SIM_BRIDGE_NODE,
 }

@@ -1,5 +1,7 @@
 """The qualities of service that the topics use."""
 
+from collections.abc import Sequence
+
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 SENSOR = QoSProfile(
@@ -38,3 +40,15 @@ EVENTS = QoSProfile(
 def state_profile(stepping: str) -> QoSProfile:
     """The profile of `state`: in lockstep the world stands still until a state is answered."""
     return LATCHED if stepping == 'lockstep' else SENSOR
+
+
+def recording_profile(publishers: Sequence[QoSProfile]) -> QoSProfile:
+    """The best quality that all publishers of a topic offer; nothing waits to be taken in vain."""
+    reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in publishers)
+    latched = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers)
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=1000,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
