@@ -26,11 +26,9 @@ def smallest_per_episode(episodes: np.ndarray, rows: np.ndarray, values: np.ndar
     """
     if not len(rows):
         return Best(episodes, rows, values)
-    order = np.argsort(rows)
-    episodes, rows, values = episodes[order], rows[order], values[order]
-    starts = np.flatnonzero(np.diff(episodes, prepend=-1))
-    smallest = np.minimum.reduceat(values, starts)
-    counts = np.diff(np.append(starts, len(rows)))
-    hits = np.flatnonzero(values == np.repeat(smallest, counts))
-    firsts = hits[np.searchsorted(hits, starts)]
-    return Best(episodes[starts], rows[firsts], smallest)
+    smallest = np.full(episodes.max() + 1, np.inf)
+    np.minimum.at(smallest, episodes, values)
+    hits = np.flatnonzero(values == smallest[episodes])
+    hits = hits[np.argsort(rows[hits])]  # few: one per trajectory, and ties
+    firsts = hits[np.flatnonzero(np.diff(episodes[hits], prepend=-1))]
+    return Best(episodes[firsts], rows[firsts], values[firsts])

@@ -15,6 +15,9 @@ class Neighbours(NamedTuple):
     distances: np.ndarray
 
 
+_NOTHING = Neighbours(np.empty(0, np.int64), np.empty(0))
+
+
 class SpatialIndex:
     """Finds every row within a radius without touching the rest of the dataset.
 
@@ -95,9 +98,14 @@ class SpatialIndex:
             strict: Exclude the boundary.
         """
         point = np.asarray(point, np.float64)
-        slices = self._candidates(point, radius)
-        rows = _gather(self._order, slices)
-        distances = self._distances([_gather(c, slices) for c in self._columns], point)
+        parts = self._parts(point, radius)
+        found = [_NOTHING, *(self._near(part, point, radius, strict) for part in parts)]
+        return Neighbours(*(np.concatenate(arrays) for arrays in zip(*found, strict=True)))
+
+    def _near(self, part: slice, point: np.ndarray, radius: float, strict: bool) -> Neighbours:
+        """Those of one run of sorted rows that are in the ball."""
+        distances = self._distances([column[part] for column in self._columns], point)
+        rows = self._order[part]
         if len(self._dims) > 2:
             # In all coordinates a point is at least as far as in two of them.
             rows = rows[distances <= radius * (1 + 1e-9)]
@@ -120,14 +128,17 @@ class SpatialIndex:
         """Scaled Euclidean distances (n,), float64, of points given by coordinate to `point`."""
         squared = np.zeros(len(columns[0]))
         for column, center, factor in zip(columns, point, self._scale, strict=False):
-            squared += np.square((column - center) * factor)
+            difference = column - center
+            difference *= factor
+            difference *= difference
+            squared += difference
         return np.sqrt(squared, out=squared)
 
     def _cell(self, values: np.ndarray, axis: int) -> np.ndarray:
         return np.floor((values - self._origin[axis]) / self._edges[axis]).astype(np.int64)
 
-    def _candidates(self, point: np.ndarray, radius: float) -> list[slice]:
-        """Slices of the sorted rows whose cells overlap the ball's bounding box."""
+    def _parts(self, point: np.ndarray, radius: float) -> list[slice]:
+        """Runs of the sorted rows whose cells overlap the ball's bounding box."""
         planar = (point * self._scale)[:2]
         margin = radius * (1 + 1e-9) + 1e-9 * (np.abs(planar) + np.abs(self._origin)).max()
         low = np.maximum(planar - margin, self._origin)
@@ -141,7 +152,3 @@ class SpatialIndex:
         begin = self._starts[np.searchsorted(self._keys, columns + in_column[0], side='left')]
         end = self._starts[np.searchsorted(self._keys, columns + in_column[1], side='right')]
         return [slice(a, b) for a, b in zip(begin, end, strict=True) if a < b]
-
-
-def _gather(values: np.ndarray, slices: list[slice]) -> np.ndarray:
-    return np.concatenate([values[part] for part in slices]) if slices else values[:0]
