@@ -16,6 +16,9 @@ import yaml
 PACKAGE = Path(__file__).parents[2] / 'ros2_ws' / 'src' / 'metagcttt'
 
 
+OPTIONAL = {'recorder_node', 'visualization_node'}
+
+
 class Recorder:
     """Stands for any class of launch: remembers what it was made with."""
 
@@ -57,7 +60,7 @@ def test_every_argument_is_described_and_finite_ones_list_their_values(launched)
 
 
 def test_all_nodes_start_under_their_names(launched) -> None:
-    assert launched.nodes.keys() == TABLES.keys() - {'recorder_node'}
+    assert launched.nodes.keys() == TABLES.keys() - OPTIONAL
     assert all(node.kwargs['name'] == name for name, node in launched.nodes.items())
     assert type(launched.nodes['policy_node']).__name__ == 'LifecycleNode'
 
@@ -75,7 +78,7 @@ def test_parameters_given_by_launch_exist(launched) -> None:
 def test_parameter_file_fits_the_nodes(stepping: str) -> None:
     text = (PACKAGE / 'config' / f'{stepping}.yaml').read_text(encoding='utf-8')
     sections = yaml.safe_load(text)
-    assert {name.removeprefix('/**/') for name in sections} == TABLES.keys() - {'recorder_node'}
+    assert {name.removeprefix('/**/') for name in sections} == TABLES.keys() - OPTIONAL
     for name, section in sections.items():
         table = {parameter.name: parameter for parameter in TABLES[name.removeprefix('/**/')]}
         values = section['ros__parameters']

@@ -15,6 +15,7 @@ setup(
         (f'share/{NAME}', ['package.xml']),
         (f'share/{NAME}/launch', glob('launch/*.launch.py')),
         (f'share/{NAME}/config', glob('config/*.yaml')),
+        (f'share/{NAME}/rviz', glob('rviz/*.rviz')),
     ],
     install_requires=['setuptools'],
     zip_safe=True,
@@ -25,7 +26,13 @@ setup(
     entry_points={
         'console_scripts': [
             f'{node} = {NAME}.main:{node}'
-            for node in ('goal_node', 'policy_node', 'recorder_node', 'sim_bridge_node')
+            for node in (
+                'goal_node',
+                'policy_node',
+                'recorder_node',
+                'sim_bridge_node',
+                'visualization_node',
+            )
         ]
     },
 )

@@ -33,3 +33,11 @@ def sim_bridge_node() -> int:
     from metagcttt.sim_bridge_node import SimBridgeNode
 
     return run(SimBridgeNode, stop)
+
+
+def visualization_node() -> int:
+    """Run the node that makes what RViz shows until Ctrl-C or SIGTERM; returns the exit code."""
+    stop = stop_on_signals()
+    from metagcttt.visualization_node import VisualizationNode
+
+    return run(VisualizationNode, stop)

@@ -198,9 +198,41 @@ RECORDER_NODE = (
     ),
 )
 
+VISUALIZATION_NODE = (
+    ENVIRONMENT,
+    DATASET,
+    Parameter(
+        'checkpoint', '', 'folder of the policy, whose critic is shown; empty: the committed one'
+    ),
+    Parameter('base_frame_id', 'base_link', "the agent's own frame, in which odom has its speed"),
+    Parameter(
+        'rate_hz',
+        2.0,
+        'how often path and markers are published when they have changed, per second',
+        minimum=0.1,
+        maximum=20,
+    ),
+    Parameter(
+        'path_poses',
+        500,
+        'poses of the path, 0.1 m apart; older ones are dropped',
+        minimum=2,
+        maximum=5000,
+    ),
+    Parameter(
+        'marker_points',
+        2000,
+        'points of the retrieved sub-trajectories; more are thinned out',
+        minimum=2,
+        maximum=50000,
+        changes='now',
+    ),
+)
+
 TABLES = {
     'goal_node': GOAL_NODE,
     'policy_node': POLICY_NODE,
     'recorder_node': RECORDER_NODE,
     'sim_bridge_node': SIM_BRIDGE_NODE,
+    'visualization_node': VISUALIZATION_NODE,
 }

@@ -1,0 +1,120 @@
+"""What RViz shows, made from positions. Pure functions; no node is needed to use them."""
+
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+import math
+
+from geometry_msgs.msg import PoseStamped, Quaternion
+from nav_msgs.msg import Odometry, Path
+import numpy as np
+from numpy.typing import NDArray
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from metagcttt.converters import to_point
+
+GOLD = (1.0, 0.84, 0.0, 0.9)
+GREY = (0.5, 0.5, 0.5, 0.8)
+WHITE = (1.0, 1.0, 1.0, 1.0)
+LINE_WIDTH_M = 0.06
+TEXT_HEIGHT_M = 0.8
+
+
+def odometry(
+    header: Header, base_frame: str, xy: tuple[float, float], yaw: float, speed: float
+) -> Odometry:
+    """Where the agent is and how fast it moves ahead.
+
+    Args:
+        header: Time and frame of the position.
+        base_frame: Frame of the velocity, the agent's own.
+        xy: Position in metres.
+        yaw: Direction of travel, radians, counted from x towards y.
+        speed: Along that direction, metres per second.
+    """
+    message = Odometry(header=header, child_frame_id=base_frame)
+    message.pose.pose.position = to_point(xy)
+    message.pose.pose.orientation = Quaternion(z=math.sin(yaw / 2), w=math.cos(yaw / 2))
+    message.twist.twist.linear.x = float(speed)
+    return message
+
+
+def path(header: Header, positions: Iterable[tuple[float, float]]) -> Path:
+    """Positions in metres as a path; the poses look along x."""
+    message = Path(header=header)
+    for xy in positions:
+        pose = PoseStamped(header=header)
+        pose.pose.position = to_point(xy)
+        pose.pose.orientation.w = 1.0
+        message.poses.append(pose)
+    return message
+
+
+def markers(
+    header: Header,
+    *,
+    goal: tuple[float, float] | None,
+    radius_m: float,
+    segments: Sequence[NDArray[np.floating]],
+    value: float | None,
+    xy: tuple[float, float],
+) -> MarkerArray:
+    """The goal, what was retrieved for it and the value of the current state.
+
+    What is absent is deleted from the picture.
+
+    Args:
+        header: Time and frame.
+        goal: Its position in metres, if there is one.
+        radius_m: Distance within which it is reached, metres.
+        segments: Sub-trajectories, each (n, 2) in metres.
+        value: Of the current state for the goal, if the policy has a critic.
+        xy: The agent's position in metres.
+    """
+    disc = _marker(header, 'goal', Marker.CYLINDER, GOLD, shown=goal is not None)
+    if goal is not None:
+        disc.pose.position = to_point(goal)
+        disc.scale.x = disc.scale.y = 2.0 * float(radius_m)
+        disc.scale.z = 0.1
+    lines = _marker(header, 'retrieved', Marker.LINE_LIST, GREY, shown=bool(len(segments)))
+    lines.scale.x = LINE_WIDTH_M
+    for segment in segments:
+        points = [to_point(row) for row in segment]
+        for pair in pairwise(points):
+            lines.points.extend(pair)
+    text = _marker(header, 'value', Marker.TEXT_VIEW_FACING, WHITE, shown=value is not None)
+    if value is not None:
+        text.pose.position = to_point((xy[0], xy[1] + TEXT_HEIGHT_M))
+        text.scale.z = TEXT_HEIGHT_M
+        text.text = f'V = {value:.2f}'
+    return MarkerArray(markers=[lines, disc, text])
+
+
+def _marker(
+    header: Header, namespace: str, kind: int, color: Sequence[float], *, shown: bool
+) -> Marker:
+    r, g, b, a = color
+    marker = Marker(
+        header=header,
+        ns=namespace,
+        type=kind,
+        action=Marker.ADD if shown else Marker.DELETE,
+        color=ColorRGBA(r=r, g=g, b=b, a=a),
+    )
+    marker.pose.orientation.w = 1.0
+    return marker
+
+
+def thinned(
+    segments: Sequence[NDArray[np.floating]], max_points: int
+) -> list[NDArray[np.floating]]:
+    """Sub-trajectories with every n-th point only, so that all have about `max_points` at most.
+
+    The last point of each is kept. Those of a single point have no line and are left out.
+    """
+    stride = max(1, math.ceil(sum(len(segment) for segment in segments) / max_points))
+    return [
+        np.concatenate([segment[:-1:stride], segment[-1:]])
+        for segment in segments
+        if len(segment) > 1
+    ]
