@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from domain_coordinator import domain_id
+from metagcttt.commander import NoAnswerError
 from metagcttt_core import TrajectoryDataset
 from metagcttt_core.config import assets_dir, Settings
 from metagcttt_core.files import atomic_write
@@ -19,7 +20,7 @@ from sim_bridge import make_simulator
 from tqdm import tqdm
 
 from tools.cli import fail, parse
-from tools.maze_client import GoalOutcome, MazeClient, NoAnswerError
+from tools.maze_client import GoalOutcome, MazeClient
 from tools.node_process import NodeFailedError, NodeProcess
 from tools.plots import demo_picture, save
 from tools.runs import provenance

@@ -6,20 +6,15 @@ from functools import partial
 import time
 
 from geometry_msgs.msg import PoseStamped
+from metagcttt.commander import NoAnswerError, RobotCommander
 from metagcttt_interfaces.msg import AdaptationReport, EpisodeEvent, MazeState
 from metagcttt_interfaces.srv import SetTask
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 _RELIABLE = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
 _LATCHED = QoSProfile(
     depth=10, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
-
-
-class NoAnswerError(RuntimeError):
-    """The graph did not answer in time."""
 
 
 @dataclass
@@ -50,7 +45,7 @@ class _Watched:
     reports: list[AdaptationReport] = field(default_factory=list)
 
 
-class MazeClient(Node):
+class MazeClient(RobotCommander):
     """Drives the graph by its public names: `set_task`, `goal_pose`, `episode`, `adaptation`."""
 
     def __init__(self, check_processes: Callable[[], None]) -> None:
@@ -59,13 +54,9 @@ class MazeClient(Node):
         Args:
             check_processes: Called while waiting; raises when a node process has died.
         """
-        super().__init__('maze_client')
-        self._check_processes = check_processes
+        super().__init__(name='maze_client', while_waiting=check_processes)
         self._seen = _Watched()
-        self._executor = SingleThreadedExecutor()
-        self._executor.add_node(self)
         self._goal_pose = self.create_publisher(PoseStamped, 'goal_pose', 10)
-        self._set_task = self.create_client(SetTask, 'set_task')
         self.create_subscription(
             MazeState, 'state', lambda state: self._seen.states.append(state), _RELIABLE
         )
@@ -78,19 +69,6 @@ class MazeClient(Node):
             lambda report: self._seen.reports.append(report),
             _LATCHED,
         )
-
-    def wait(self, condition: Callable[[], bool], what: str, timeout_s: float) -> None:
-        """Take in messages until `condition` holds.
-
-        Raises:
-            NoAnswerError: If it does not hold within `timeout_s`; names `what`.
-        """
-        deadline = time.monotonic() + timeout_s
-        while not condition():
-            self._check_processes()
-            if time.monotonic() > deadline:
-                raise NoAnswerError(f'no answer within {timeout_s:g} s: {what}')
-            self._executor.spin_once(timeout_sec=0.1)
 
     def wait_until_ready(self, timeout_s: float = 30.0) -> None:
         """Wait for the three nodes."""
@@ -109,14 +87,11 @@ class MazeClient(Node):
     def drive(self, task_id: int, seed: int, timeout_s: float = 60.0) -> GoalOutcome:
         """Put the robot at a task's start, publish its goal and watch what becomes of it."""
         self._seen = _Watched()
-        request = SetTask.Request(task_id=task_id, seed=seed, send_goal=False)
-        future = self._set_task.call_async(request)
-        self.wait(future.done, f'set_task {task_id}', timeout_s)
-        answer = future.result()
+        answer = self.set_task(task_id, seed, timeout_s=timeout_s)
         if not answer.success:
             raise NoAnswerError(f'set_task {task_id} was refused: {answer.message}')
         accepted = self._publish_goal(answer, timeout_s)
-        ends = (EpisodeEvent.REACHED, EpisodeEvent.TIMED_OUT)
+        ends = (EpisodeEvent.REACHED, EpisodeEvent.TIMED_OUT, EpisodeEvent.ENDED)
         find_end = partial(self._events_of, accepted.query_id, ends)
         self.wait(lambda: bool(find_end()), 'the goal', timeout_s)
         end = find_end()[0]

@@ -7,12 +7,10 @@ from metagcttt.converters import (
     to_floats,
     to_point,
     to_time,
-    vector_fault,
 )
 from metagcttt_core import Adaptation, make_agent, SupportSet
 from metagcttt_interfaces.msg import MazeState
 import numpy as np
-import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 from sim_bridge import MazeMap
 from std_msgs.msg import Header
@@ -35,20 +33,6 @@ def test_received_array_is_a_copy() -> None:
     floats = to_floats(VALUES)
     to_array(floats)[0] = 9.0
     assert floats[0] == VALUES[0]
-
-
-@pytest.mark.parametrize(
-    ('values', 'fault'),
-    [
-        ([1.0, 2.0], ''),
-        ([1.0], 'the state has 1 values, 2 are needed'),
-        ([], 'the state has 0 values, 2 are needed'),
-        ([1.0, np.nan], 'the state is not finite: [1.0, nan]'),
-        ([-np.inf, 0.0], 'the state is not finite: [-inf, 0.0]'),
-    ],
-)
-def test_vector_fault(values: list[float], fault: str) -> None:
-    assert vector_fault('the state', np.array(values, dtype=np.float64), 2) == fault
 
 
 def test_time_splits_nanoseconds() -> None:

@@ -181,7 +181,7 @@ def test_restarted_simulator_voids_the_goal(rig: Rig) -> None:
 
 def test_task_goal_of_another_size_is_rejected(rig: Rig) -> None:
     rig.started(3, goal=(1.0, 2.0, 3.0))
-    assert "the task's goal has 3 values, 2 are needed" in rig.event(REJECTED).reason
+    assert 'the goal has 3 values, 2 are needed' in rig.event(REJECTED).reason
 
 
 def test_late_goal_node_still_takes_up_the_running_task(graph: Graph, dataset_file: Path) -> None:

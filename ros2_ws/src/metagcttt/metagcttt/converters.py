@@ -2,16 +2,20 @@
 
 from array import array
 from collections.abc import Iterable, Sequence
+import math
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point
 from metagcttt_core import Adaptation, SupportSet
-from metagcttt_interfaces.msg import ActionCommand, AdaptationReport, MazeState
+from metagcttt_interfaces.action import ReachGoal
+from metagcttt_interfaces.msg import ActionCommand, AdaptationReport, MazeState, PolicyStatus
 from nav_msgs.msg import OccupancyGrid
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sim_bridge import MazeMap
 from std_msgs.msg import Header
+
+from metagcttt.goals import Goal
 
 OCCUPIED = 100
 FREE = 0
@@ -27,15 +31,6 @@ def to_floats(values: ArrayLike) -> 'array[float]':
 def to_array(floats: Sequence[float]) -> NDArray[np.float64]:
     """The values of a float64[] field as a new array, shape (n,)."""
     return np.array(floats, dtype=np.float64)
-
-
-def vector_fault(name: str, values: NDArray[np.float64], size: int) -> str:
-    """Why `values` is not a vector of `size` finite numbers; empty when it is."""
-    if values.shape != (size,):
-        return f'{name} has {values.size} values, {size} are needed'
-    if not np.isfinite(values).all():
-        return f'{name} is not finite: {values.tolist()}'
-    return ''
 
 
 def to_point(xy: Iterable[float]) -> Point:
@@ -126,6 +121,25 @@ def report_message(
         message.accepted = bool(adaptation.accepted)
         message.reason = adaptation.reason
     return message
+
+
+def feedback_message(goal: Goal, state: MazeState, policy: PolicyStatus) -> ReachGoal.Feedback:
+    """How far a goal is: by the newest state and by what the policy last said of itself."""
+    xy = (state.position.x, state.position.y)
+    feedback = ReachGoal.Feedback(
+        phase=ReachGoal.Feedback.WAITING,
+        distance_m=math.dist(xy, goal.xy),
+        steps=max(state.step - goal.first_step, 0) if state.episode_id == goal.episode_id else 0,
+    )
+    if policy.query_id == goal.query_id:
+        feedback.phase = {
+            PolicyStatus.ADAPTING: ReachGoal.Feedback.ADAPTING,
+            PolicyStatus.ACTING: ReachGoal.Feedback.DRIVING,
+        }.get(policy.phase, ReachGoal.Feedback.WAITING)
+        feedback.adapt_steps_done = policy.steps_done
+        feedback.adapt_steps = policy.steps
+        feedback.adapted = policy.adapted
+    return feedback
 
 
 def occupancy_grid(maze: MazeMap, header: Header) -> OccupancyGrid:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 from metagcttt_core import (
@@ -84,6 +85,7 @@ def answer_query(
     config: TTTConfig,
     seed: int,
     should_stop: Callable[[], bool],
+    on_step: Callable[[int], None] = lambda steps_done: None,
 ) -> Outcome:
     """Filter and adapt for one query, as an evaluation episode does.
 
@@ -94,6 +96,7 @@ def answer_query(
         config: Inner loop; 0 steps ask for the base policy.
         seed: Of everything random in the inner loop.
         should_stop: Asked before every step.
+        on_step: Called before every step with the number of steps done.
 
     Raises:
         AdaptationCancelled: If `should_stop` returned true.
@@ -102,6 +105,14 @@ def answer_query(
     if config.steps == 0:
         reason = 'adaptation is switched off (0 steps)'
         return Outcome(None, Adaptation(agent, [], [], 0, False, reason, 0.0))
+    steps_done = count()
+
+    def stop_or_go_on() -> bool:
+        stop = should_stop()
+        if not stop:
+            on_step(next(steps_done))
+        return stop
+
     support = trajectory_filter.query(observation, goal, agent.value_fn)
     return Outcome(
         support,
@@ -112,6 +123,6 @@ def answer_query(
             goal,
             config,
             seed=seed,
-            should_stop=should_stop,
+            should_stop=stop_or_go_on,
         ),
     )

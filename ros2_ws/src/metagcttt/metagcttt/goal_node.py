@@ -1,28 +1,32 @@
 """The node that takes goals and decides when they are over."""
 
+import time
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 from metagcttt_core import TrajectoryDataset, TrajectoryFilter
-from metagcttt_interfaces.msg import EpisodeEvent, GoalQuery, MazeState
+from metagcttt_interfaces.action import ReachGoal
+from metagcttt_interfaces.msg import EpisodeEvent, MazeState, PolicyStatus
 import numpy as np
 from numpy.typing import NDArray
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sim_bridge import describe_environment
-from std_msgs.msg import Header
 
-from metagcttt.converters import to_array, to_floats, to_point, vector_fault
+from metagcttt.converters import feedback_message, to_array
 from metagcttt.deployment import dataset_path
-from metagcttt.goals import Goal, goal_ending, GoalCatalog
+from metagcttt.goal_announcer import GoalAnnouncer
+from metagcttt.goals import Goal, goal_ending, GoalCatalog, Verdict
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import GOAL_NODE
 from metagcttt.qos import COMMAND, EVENTS, LATCHED, state_profile
+from metagcttt.reach_goal_server import ReachGoalServer
 
-ENDING_KINDS = {'reached': EpisodeEvent.REACHED, 'timed out': EpisodeEvent.TIMED_OUT}
+WATCH_PERIOD_S = 0.1
 
 
 class GoalNode(Node):
-    """Turns poses and task goals into numbered queries, one at a time, and ends them.
+    """Turns poses, action goals and task goals into numbered queries, one at a time.
 
     A goal belongs to the episode in which it was accepted; a newer goal replaces it and a new
     episode voids it.
@@ -45,51 +49,102 @@ class GoalNode(Node):
         dataset = TrajectoryDataset.load(dataset_path(self._settings['dataset']))
         self._catalog = GoalCatalog(description, TrajectoryFilter(dataset))
         self._state: MazeState | None = None
+        self._state_time = self.get_clock().now()
+        self._source_seen_s = time.monotonic()
+        self._policy = PolicyStatus()
         self._goal: Goal | None = None
         self._num_accepted = 0
 
-        self._queries = self.create_publisher(GoalQuery, 'goal', LATCHED)
-        self._events = self.create_publisher(EpisodeEvent, 'episode', EVENTS)
+        self._say = GoalAnnouncer(self, self._settings['frame_id'])
         profile = state_profile(self._settings['stepping'])
         self.create_subscription(MazeState, 'state', self._on_state, profile)
         self.create_subscription(PoseStamped, 'goal_pose', self._on_goal_pose, COMMAND)
         self.create_subscription(EpisodeEvent, 'episode', self._on_event, EVENTS)
+        self.create_subscription(PolicyStatus, 'policy_status', self._on_policy, LATCHED)
+        self._reach_goal = ReachGoalServer(
+            self,
+            is_acceptable=self._is_acceptable,
+            begin=self._begin,
+            cancel=lambda: self._end(Verdict('CANCELED', 'canceled')),
+        )
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(WATCH_PERIOD_S, self._watch, clock=steady)
         self.get_logger().info(f'goals in {self._spec.name}, completed from {dataset.source}')
+
+    def end_service(self) -> None:
+        """Stop the robot and tell whoever waits for it; the node is about to go down."""
+        self._end(Verdict('SHUTDOWN', 'the goal node is going down'))
+
+    def destroy_node(self) -> None:
+        """Withdraw the action, then destroy the node."""
+        self._reach_goal.destroy()
+        super().destroy_node()
 
     # --- goals come in -----------------------------------------------------------------------
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
-        x, y = message.pose.position.x, message.pose.position.y
+        request = ReachGoal.Goal(pose=message)
+        if self._is_acceptable(request):
+            self._begin(request)
+
+    def _is_acceptable(self, request: ReachGoal.Goal) -> bool:
+        """Whether to take a goal; publishes why not."""
+        refusal = self._refusal(request)
+        if refusal is not None:
+            point = request.pose.pose.position
+            self._say.rejected(refusal, (point.x, point.y), self._state, request.request_id)
+        return refusal is None
+
+    def _refusal(self, request: ReachGoal.Goal) -> Verdict | None:
         frame, state = self._settings['frame_id'], self._state
-        if message.header.frame_id != frame:
-            reason = f'the goal is in frame {message.header.frame_id!r}, goals are in {frame!r}'
-        elif state is None:
-            reason = 'no state of the simulator has arrived yet'
-        elif state.terminated or state.truncated:
+        given_frame = request.pose.header.frame_id
+        if given_frame != frame and not request.goal:
+            reason = f'the goal is in frame {given_frame!r}, goals are in {frame!r}'
+            return Verdict('WRONG_FRAME', reason)
+        if state is None:
+            if not request.episode_id:
+                return Verdict('NO_STATE', 'no state of the simulator has arrived yet')
+        elif request.episode_id and request.episode_id < state.episode_id:
+            reason = f'episode {request.episode_id} is over, {state.episode_id} is the newest'
+            return Verdict('EPISODE_OVER', reason)
+        elif request.episode_id <= state.episode_id and (state.terminated or state.truncated):
             reason = f'episode {state.episode_id} has ended: reset the simulator or set a task'
+            return Verdict('EPISODE_OVER', reason)
+        if request.goal:
+            return self._catalog.observation_refusal(to_array(request.goal))
+        point = request.pose.pose.position
+        return self._catalog.refusal(point.x, point.y)
+
+    def _begin(self, request: ReachGoal.Goal) -> None:
+        """Take up a goal that is acceptable."""
+        self._expect_episode(request.episode_id)
+        state, point = self._state, request.pose.pose.position
+        assert state is not None, 'checked by _refusal'
+        if request.goal:
+            observation = to_array(request.goal)
         else:
-            reason = self._catalog.refusal(x, y)
-        if reason or state is None:
-            self._publish_event(EpisodeEvent.GOAL_REJECTED, (x, y), reason)
-            return
+            observation = self._catalog.complete(point.x, point.y)
         self._accept(
-            self._catalog.complete(x, y),
+            observation,
             episode_id=state.episode_id,
             step=state.step,
             seed=self._settings['seed'],
             is_task=False,
+            max_steps=request.max_steps,
+            request_id=request.request_id,
         )
 
     def _on_event(self, message: EpisodeEvent) -> None:
         if message.kind != EpisodeEvent.STARTED:
             return
         self._void_unless(message.episode_id)
+        self._expect_episode(message.episode_id)
         if not message.goal:
             return
         goal = to_array(message.goal)
-        reason = vector_fault("the task's goal", goal, self._spec.obs_dim)
-        if reason:
-            self._publish_event(EpisodeEvent.GOAL_REJECTED, (0.0, 0.0), reason)
+        refusal = self._catalog.observation_refusal(goal)
+        if refusal is not None:
+            self._say.rejected(refusal, (0.0, 0.0), self._state)
             return
         self._accept(
             goal,
@@ -99,6 +154,12 @@ class GoalNode(Node):
             is_task=True,
         )
 
+    def _expect_episode(self, episode_id: int) -> None:
+        """Turn to a newer episode whose first state is on the way."""
+        if episode_id > (self._state.episode_id if self._state else 0):
+            self._void_unless(episode_id)
+            self._state = MazeState(episode_id=episode_id)
+
     def _accept(
         self,
         observation: NDArray[np.float64],
@@ -107,24 +168,34 @@ class GoalNode(Node):
         step: int,
         seed: int,
         is_task: bool,
+        max_steps: int = 0,
+        request_id: str = '',
     ) -> None:
         self._num_accepted += 1
+        number = self._num_accepted
+        self._end(Verdict('PREEMPTED', f'goal {number} took its place'), replaced=True)
         self._goal = Goal(
-            query_id=self._num_accepted,
+            query_id=number,
             episode_id=episode_id,
             observation=observation,
             xy=self._catalog.position(observation),
             seed=seed,
             first_step=step,
             is_task=is_task,
+            max_steps=max_steps,
+            request_id=request_id,
+            accepted_ns=self.get_clock().now().nanoseconds,
         )
-        self._publish_query(self._goal, active=True)
-        self._publish_event(EpisodeEvent.GOAL_ACCEPTED, self._goal.xy, '', self._goal)
+        self._say.query(self._goal, active=True)
+        self._say.accepted(self._goal)
 
-    # --- goals end ---------------------------------------------------------------------------
+    # --- goals go on and end -----------------------------------------------------------------
 
     def _on_state(self, message: MazeState) -> None:
+        if self._goal is not None and message.episode_id < self._goal.episode_id:
+            return  # the goal's own episode is on the way
         self._state = message
+        self._state_time = self.get_clock().now()
         if self._goal is not None and message.episode_id > self._goal.episode_id:
             self._void_unless(message.episode_id)
         if self._goal is None or message.episode_id != self._goal.episode_id:
@@ -136,62 +207,54 @@ class GoalNode(Node):
             ended=message.terminated or message.truncated,
             success=message.success,
             tolerance_m=self._settings['goal_tolerance_m'] or self._spec.goal_tolerance_m,
-            max_steps=self._settings['max_steps'] or self._spec.max_episode_steps,
+            max_steps=self._goal.max_steps
+            or self._settings['max_steps']
+            or self._spec.max_episode_steps,
         )
-        if ending is not None:
-            how, reason = ending
-            goal, self._goal = self._goal, None
-            self._publish_query(goal, active=False)
-            self._publish_event(ENDING_KINDS[how], goal.xy, reason, goal)
+        if ending is None:
+            self._report_progress()
+        else:
+            self._end(ending)
+
+    def _on_policy(self, message: PolicyStatus) -> None:
+        self._policy = message
+        self._report_progress()
+
+    def _report_progress(self) -> None:
+        if self._goal is not None and self._state is not None:
+            self._reach_goal.report(feedback_message(self._goal, self._state, self._policy))
+
+    def _watch(self) -> None:
+        """Give a goal up when the simulator is silent; in lockstep, when it is gone."""
+        now_s = time.monotonic()
+        awaited = (
+            self._goal is not None and self._state is not None and not self._state.observation
+        )
+        if self.count_publishers('state') and not awaited:
+            self._source_seen_s = now_s
+        age_s = now_s - self._source_seen_s
+        if self._settings['stepping'] == 'realtime':
+            silence = self.get_clock().now() - self._state_time
+            age_s = max(age_s, silence.nanoseconds / 1e9)
+        if self._goal is not None and age_s > self._settings['state_timeout_s']:
+            reason = f'no state of episode {self._goal.episode_id} for {age_s:.1f} s'
+            self._end(Verdict('STATE_LOST', reason))
 
     def _void_unless(self, episode_id: int) -> None:
         """Drop a goal of another episode."""
         if self._goal is not None and self._goal.episode_id != episode_id:
-            goal, self._goal = self._goal, None
-            self._publish_query(goal, active=False)
-            self.get_logger().info(f'goal {goal.query_id} is void: episode {episode_id} began')
+            self._end(Verdict('NEW_EPISODE', f'episode {episode_id} began'))
 
-    # --- what is published -------------------------------------------------------------------
-
-    def _header(self) -> Header:
-        return Header(stamp=self.get_clock().now().to_msg(), frame_id=self._settings['frame_id'])
-
-    def _publish_query(self, goal: Goal, *, active: bool) -> None:
-        self._queries.publish(
-            GoalQuery(
-                header=self._header(),
-                query_id=goal.query_id,
-                episode_id=goal.episode_id,
-                active=active,
-                goal=to_floats(goal.observation),
-                position=to_point(goal.xy),
-                seed=goal.seed,
-            )
-        )
-
-    def _publish_event(
-        self, kind: int, xy: tuple[float, float], reason: str, goal: Goal | None = None
-    ) -> None:
-        state = self._state
-        episode_id = goal.episode_id if goal else state.episode_id if state else 0
-        self._events.publish(
-            EpisodeEvent(
-                header=self._header(),
-                kind=kind,
-                episode_id=episode_id,
-                query_id=goal.query_id if goal else 0,
-                step=state.step if state and state.episode_id == episode_id else 0,
-                reason=reason,
-                position=to_point(xy),
-            )
-        )
-        name = {
-            EpisodeEvent.GOAL_ACCEPTED: 'accepted',
-            EpisodeEvent.GOAL_REJECTED: 'rejected',
-            EpisodeEvent.REACHED: 'reached',
-            EpisodeEvent.TIMED_OUT: 'timed out',
-        }[kind]
-        number = f' {goal.query_id}' if goal else ''
-        self.get_logger().info(
-            f'goal{number} at ({xy[0]:.2f}, {xy[1]:.2f}) {name}{": " if reason else ""}{reason}'
-        )
+    def _end(self, verdict: Verdict, *, replaced: bool = False) -> None:
+        """End the goal in force, if any, and say so; a newer query follows when `replaced`."""
+        goal, self._goal = self._goal, None
+        if goal is None:
+            return
+        if not replaced:
+            self._say.query(goal, active=False)
+        step = goal.first_step
+        if self._state is not None and self._state.episode_id == goal.episode_id:
+            step = max(step, self._state.step)
+        self._say.ended(goal, verdict, step)
+        seconds = (self.get_clock().now().nanoseconds - goal.accepted_ns) / 1e9
+        self._reach_goal.finish(verdict, step - goal.first_step, seconds)

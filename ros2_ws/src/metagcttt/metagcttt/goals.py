@@ -9,6 +9,35 @@ import numpy as np
 from numpy.typing import NDArray
 from sim_bridge import MazeDescription
 
+from metagcttt.vectors import vector_fault
+
+Error = Literal[
+    'NONE',
+    'WRONG_FRAME',
+    'NOT_FINITE',
+    'OUTSIDE_MAZE',
+    'IN_WALL',
+    'WRONG_SIZE',
+    'NO_STATE',
+    'EPISODE_OVER',
+    'PREEMPTED',
+    'CANCELED',
+    'TIMED_OUT',
+    'EPISODE_ENDED',
+    'NEW_EPISODE',
+    'STATE_LOST',
+    'SHUTDOWN',
+]
+"""The names of the error codes of ReachGoal's result."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Why a goal is refused, or how it ended; `reason` is for people."""
+
+    error: Error
+    reason: str
+
 
 @dataclass(frozen=True)
 class Goal:
@@ -22,6 +51,9 @@ class Goal:
         seed: Seed of the adaptation to it.
         first_step: Control step of the episode at which it was accepted.
         is_task: Whether it is the goal of the episode's own task.
+        max_steps: Control steps that it may take; 0 for the goal node's own limit.
+        request_id: Name that the sender of an action goal gave it.
+        accepted_ns: When it was accepted, nanoseconds of the goal node's clock.
     """
 
     query_id: int
@@ -31,6 +63,9 @@ class Goal:
     seed: int
     first_step: int
     is_task: bool
+    max_steps: int = 0
+    request_id: str = ''
+    accepted_ns: int = 0
 
 
 class GoalCatalog:
@@ -52,19 +87,29 @@ class GoalCatalog:
         self._position_dims = list(description.spec.position_dims)
         self._filter = trajectory_filter
 
-    def refusal(self, x: float, y: float) -> str:
-        """Why the position (x, y), in metres, cannot be a goal; empty when it can."""
+    def refusal(self, x: float, y: float) -> Verdict | None:
+        """Why the position (x, y), in metres, cannot be a goal; None when it can."""
         if not (math.isfinite(x) and math.isfinite(y)):
-            return f'the position ({x}, {y}) is not finite'
+            return Verdict('NOT_FINITE', f'the position ({x}, {y}) is not finite')
         if not self._maze.contains(x, y):
             xmin, xmax, ymin, ymax = self._maze.extent
-            return (
+            return Verdict(
+                'OUTSIDE_MAZE',
                 f'({x:.2f}, {y:.2f}) is outside the maze, which spans x {xmin:g} to {xmax:g} '
-                f'and y {ymin:g} to {ymax:g} metres'
+                f'and y {ymin:g} to {ymax:g} metres',
             )
         if not self._maze.is_free(x, y):
-            return f'({x:.2f}, {y:.2f}) is in a wall, cell {self._maze.cell(x, y)}'
-        return ''
+            reason = f'({x:.2f}, {y:.2f}) is in a wall, cell {self._maze.cell(x, y)}'
+            return Verdict('IN_WALL', reason)
+        return None
+
+    def observation_refusal(self, observation: NDArray[np.float64]) -> Verdict | None:
+        """Why a full goal observation, shape (n,), cannot be a goal; None when it can."""
+        fault = vector_fault('the goal', observation, self._filter.dataset.obs_dim)
+        if fault:
+            wrong_size = observation.shape != (self._filter.dataset.obs_dim,)
+            return Verdict('WRONG_SIZE' if wrong_size else 'NOT_FINITE', fault)
+        return self.refusal(*self.position(observation))
 
     def complete(self, x: float, y: float) -> NDArray[np.float64]:
         """A goal observation at the position (x, y), in metres, shape (obs_dim,), float64.
@@ -82,9 +127,6 @@ class GoalCatalog:
         return float(x), float(y)
 
 
-Ending = Literal['reached', 'timed out']
-
-
 def goal_ending(
     goal: Goal,
     *,
@@ -94,7 +136,7 @@ def goal_ending(
     success: bool,
     tolerance_m: float,
     max_steps: int,
-) -> tuple[Ending, str] | None:
+) -> Verdict | None:
     """Whether a goal is over in a state of its episode.
 
     Args:
@@ -107,14 +149,15 @@ def goal_ending(
         max_steps: Control steps that a goal may take.
 
     Returns:
-        How it ended and that in words, or None while it is under way.
+        How it ended, error `NONE` when it was reached, or None while it is under way.
     """
     steps = step - goal.first_step
     distance_m = math.dist(xy, goal.xy)
     if distance_m <= tolerance_m or (goal.is_task and success):
-        return 'reached', f'after {steps} steps, {distance_m:.2f} m from the goal'
+        return Verdict('NONE', f'after {steps} steps, {distance_m:.2f} m from the goal')
     if steps >= max_steps:
-        return 'timed out', f'not reached in {steps} steps, {distance_m:.2f} m from the goal'
+        reason = f'not reached in {steps} steps, {distance_m:.2f} m from the goal'
+        return Verdict('TIMED_OUT', reason)
     if ended:
-        return 'timed out', f'the episode ended {distance_m:.2f} m from the goal'
+        return Verdict('EPISODE_ENDED', f'the episode ended {distance_m:.2f} m from the goal')
     return None

@@ -8,7 +8,7 @@ def goal_node() -> int:
     stop = stop_on_signals()
     from metagcttt.goal_node import GoalNode
 
-    return run(GoalNode, stop)
+    return run(GoalNode, stop, farewell=GoalNode.end_service)
 
 
 def policy_node() -> int:

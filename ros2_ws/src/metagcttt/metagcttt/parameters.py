@@ -39,9 +39,18 @@ GOAL_NODE = (
     Parameter(
         'seed',
         0,
-        'seed of the adaptation to goals from goal_pose',
+        'seed of the adaptation to goals that are not those of a task',
         minimum=0,
         maximum=2**63 - 1,
+        changes='now',
+    ),
+    Parameter(
+        'state_timeout_s',
+        5.0,
+        'a goal is given up when the simulator is gone, in realtime also silent, for this long, '
+        'seconds',
+        minimum=0.1,
+        maximum=3600,
         changes='now',
     ),
 )

@@ -41,6 +41,7 @@ class Query:
         adapted: Whether `expert` is an adapted one.
         adapting: Whether an adaptation is under way.
         adapted_at: Control step of the state that was last adapted to.
+        steps_done: Gradient steps done on it; counted by the thread that takes them.
     """
 
     query_id: int
@@ -53,6 +54,7 @@ class Query:
     adapted: bool = False
     adapting: bool = False
     adapted_at: int | None = None
+    steps_done: int = 0
 
     def serves(self, state: State) -> bool:
         """Whether the goal counts in `state`."""

@@ -4,18 +4,22 @@ from functools import partial
 
 from metagcttt_core import TTTConfig
 from metagcttt_core.adaptation import AdaptationCancelled
-from metagcttt_interfaces.msg import ActionCommand, AdaptationReport, GoalQuery, MazeState
+from metagcttt_interfaces.msg import GoalQuery, MazeState
+from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode
 from rclpy.timer import Timer
 
 from metagcttt.adaptation_worker import AdaptationWorker
-from metagcttt.converters import action_message, report_message, to_array, vector_fault
+from metagcttt.converters import to_array
 from metagcttt.deployment import answer_query, Deployment, Outcome
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.pilot import choose, Query, State
-from metagcttt.qos import COMMAND, EVENTS, LATCHED, state_profile
+from metagcttt.policy_announcer import PolicyAnnouncer
+from metagcttt.qos import LATCHED, state_profile
+from metagcttt.vectors import vector_fault
 
 WARNING_PERIOD_S = 5.0
+WATCH_PERIOD_S = 0.1
 
 
 class PolicySession:
@@ -50,8 +54,9 @@ class PolicySession:
         self._worker: AdaptationWorker[Query, Outcome] = AdaptationWorker(
             self._adaptation_finished.trigger, settings['threads']
         )
-        self._actions = node.create_lifecycle_publisher(ActionCommand, 'action', COMMAND)
-        self._reports = node.create_lifecycle_publisher(AdaptationReport, 'adaptation', EVENTS)
+        self._say = PolicyAnnouncer(node)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._watch = node.create_timer(WATCH_PERIOD_S, self._on_watch, clock=steady)
         profile = state_profile(settings['stepping'])
         self._inputs = (
             node.create_subscription(MazeState, 'state', self._on_state, profile),
@@ -81,8 +86,8 @@ class PolicySession:
         self._worker.close()
         for subscription in self._inputs:
             self._node.destroy_subscription(subscription)
-        for publisher in (self._actions, self._reports):
-            self._node.destroy_lifecycle_publisher(publisher)
+        self._node.destroy_timer(self._watch)
+        self._say.destroy()
         self._node.destroy_guard_condition(self._adaptation_finished)
 
     def pace(self) -> None:
@@ -124,7 +129,7 @@ class PolicySession:
             self._node.get_logger().info(f'goal {message.query_id} is over')
         elif fault:
             self._node.get_logger().error(f'goal {message.query_id} is refused: {fault}')
-            self._publish_report(message.query_id, message.episode_id, reason=fault)
+            self._say.report(message.query_id, message.episode_id, reason=fault)
         else:
             self._query = Query(
                 query_id=message.query_id,
@@ -161,6 +166,7 @@ class PolicySession:
         if self._lockstep and not self._answered and query.has_action(state):
             self._answered = True
             self._publish_action(query)
+        self._on_watch()
 
     def _adapt(self, query: Query, state: State) -> None:
         query.adapted_at = state.step
@@ -171,11 +177,12 @@ class PolicySession:
             query.goal,
             query.config,
             query.seed,
+            on_step=partial(setattr, query, 'steps_done'),
         )
         if query.config.steps == 0:
             self._conclude(query, answer(lambda: False))
         else:
-            query.adapting = True
+            query.adapting, query.steps_done = True, 0
             self._worker.start(query, answer)
 
     def _on_adaptation_finished(self) -> None:
@@ -191,13 +198,14 @@ class PolicySession:
                 except (ValueError, RuntimeError) as error:
                     reason = f'failed: {error}'
                     self._node.get_logger().error(f'goal {query.query_id}: {reason}')
-            self._publish_report(query.query_id, query.episode_id, reason=reason)
+            self._say.report(query.query_id, query.episode_id, reason=reason)
         self._proceed()
 
     def _conclude(self, query: Query, outcome: Outcome) -> None:
         query.expert = outcome.adaptation.agent
         query.adapted = outcome.adaptation.accepted
-        self._publish_report(query.query_id, query.episode_id, outcome)
+        query.steps_done = len(outcome.adaptation.train_losses)
+        self._say.report(query.query_id, query.episode_id, outcome)
 
     # --- what is published -------------------------------------------------------------------
 
@@ -218,36 +226,10 @@ class PolicySession:
             return
         if state.fault:
             self._warn(state.fault)
-        command = choose(state, query, self._deployment.agent.act_dim)
-        self._actions.publish(
-            action_message(
-                self._node.get_clock().now().to_msg(),
-                episode_id=state.episode_id,
-                step=state.step,
-                query_id=command.query_id,
-                values=command.values,
-                adapted=command.adapted,
-            )
-        )
+        self._say.action(state, choose(state, query, self._deployment.agent.act_dim))
 
-    def _publish_report(
-        self, query_id: int, episode_id: int, outcome: Outcome | None = None, reason: str = ''
-    ) -> None:
-        report = report_message(
-            self._node.get_clock().now().to_msg(),
-            query_id=query_id,
-            episode_id=episode_id,
-            support=outcome.support if outcome else None,
-            adaptation=outcome.adaptation if outcome else None,
-            reason=reason,
-        )
-        self._reports.publish(report)
-        verdict = f'adapted in {report.adapt_ms:.0f} ms' if report.accepted else 'not adapted'
-        self._node.get_logger().info(
-            f'goal {query_id}: {report.transitions} transitions of {report.kept_trajectories} of '
-            f'{report.relevant_trajectories} trajectories in {report.filter_ms:.1f} ms; {verdict}'
-            f'{": " if report.reason else ""}{report.reason}'
-        )
+    def _on_watch(self) -> None:
+        self._say.status(self._query, self._state)
 
     def _warn(self, fault: str) -> None:
         self._node.get_logger().warning(

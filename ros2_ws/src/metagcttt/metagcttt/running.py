@@ -4,6 +4,7 @@ from collections.abc import Callable
 import signal
 import threading
 from types import FrameType
+from typing import TypeVar
 
 import rclpy
 from rclpy.exceptions import ParameterException
@@ -13,6 +14,9 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+FAREWELL_SPINS = 10
+
+AnyNode = TypeVar('AnyNode', bound=Node)
 
 
 def stop_on_signals() -> threading.Event:
@@ -31,12 +35,17 @@ def stop_on_signals() -> threading.Event:
     return stop
 
 
-def run(make_node: Callable[[], Node], stop: threading.Event) -> int:
+def run(
+    make_node: Callable[[], AnyNode],
+    stop: threading.Event,
+    farewell: Callable[[AnyNode], None] | None = None,
+) -> int:
     """Spin a node until `stop` is set and take everything down in the order that leaves no error.
 
     Args:
         make_node: Makes the node. Its `destroy_node` has to join the threads it started.
         stop: From `stop_on_signals`.
+        farewell: Says goodbye to those who rely on the node, which is spun a moment longer.
 
     Returns:
         Exit code: 0 after a stop, 1 when the node could not be made; the log says why.
@@ -57,6 +66,10 @@ def run(make_node: Callable[[], Node], stop: threading.Event) -> int:
     finally:
         for number in SIGNALS:
             signal.signal(number, signal.SIG_IGN)
+        if farewell is not None:
+            farewell(node)
+            for _ in range(FAREWELL_SPINS):
+                executor.spin_once(timeout_sec=0.02)
         executor.shutdown()
         node.destroy_node()
         rclpy.try_shutdown()

@@ -23,11 +23,11 @@ from metagcttt.converters import (
     to_floats,
     to_point,
     to_time,
-    vector_fault,
 )
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import SIM_BRIDGE_NODE
 from metagcttt.qos import COMMAND, EVENTS, LATCHED, SENSOR, state_profile
+from metagcttt.vectors import vector_fault
 
 
 class SimBridgeNode(Node):

@@ -1,0 +1,282 @@
+"""For programs: drive the robot with function calls, blocking or not."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import time
+from typing import Any
+import uuid
+
+from geometry_msgs.msg import PoseStamped
+from metagcttt_interfaces.action import ReachGoal
+from metagcttt_interfaces.msg import EpisodeEvent
+from metagcttt_interfaces.srv import SetTask
+from numpy.typing import ArrayLike
+from rclpy.action import ActionClient
+from rclpy.action.client import ClientGoalHandle
+from rclpy.client import Client
+from rclpy.executors import Executor, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.task import Future
+from std_srvs.srv import SetBool, Trigger
+
+from metagcttt.converters import to_floats, to_point
+from metagcttt.qos import EVENTS
+
+
+class NoAnswerError(RuntimeError):
+    """The graph did not answer in time."""
+
+
+@dataclass(frozen=True)
+class ReachResult:
+    """What became of a goal.
+
+    Attributes:
+        success: Whether the robot is within the goal tolerance.
+        steps: Control steps it took.
+        seconds: Time it took, by the goal node's clock.
+        error_code: One of the constants of `ReachGoal.Result`; 0 on success.
+        error_msg: The same in words.
+    """
+
+    success: bool
+    steps: int = 0
+    seconds: float = 0.0
+    error_code: int = ReachGoal.Result.NONE
+    error_msg: str = ''
+
+
+class RobotCommander(Node):
+    """Sends goals and tasks to one robot.
+
+    It needs no thread and nobody to spin it: whatever waits takes in messages meanwhile. For the
+    asynchronous way call `send`, then `is_done` now and then, and `result` at the end.
+
+    Example::
+
+        commander = RobotCommander()
+        result = commander.reach((20.0, 20.0))
+        print(result.success or result.error_msg)
+    """
+
+    def __init__(
+        self,
+        *,
+        name: str = 'robot_commander',
+        frame_id: str = 'map',
+        executor: Executor | None = None,
+        while_waiting: Callable[[], None] = lambda: None,
+        **kwargs: Any,
+    ) -> None:
+        """Join the graph.
+
+        Args:
+            name: Name of the node.
+            frame_id: Frame of positions.
+            executor: To spin while waiting; one of its own by default.
+            while_waiting: Called again and again while waiting; an error it raises gets through.
+            kwargs: For `rclpy.node.Node`, such as the robot's `namespace`.
+        """
+        super().__init__(name, **kwargs)
+        self._frame_id = frame_id
+        self._while_waiting = while_waiting
+        self._spun = executor or SingleThreadedExecutor(context=self.context)
+        self._spun.add_node(self)
+        self._reach_goal = ActionClient(self, ReachGoal, 'reach_goal')
+        self._set_task = self.create_client(SetTask, 'set_task')
+        self._reset = self.create_client(Trigger, 'reset')
+        self._enable = self.create_client(SetBool, 'enable')
+        self._episode_id = 0  # begun by this commander; the goal node may not know it yet
+        self._refusals: dict[str, EpisodeEvent] = {}
+        self._refusals_from = self.create_subscription(
+            EpisodeEvent, 'episode', self._on_event, EVENTS
+        )
+
+    # --- goals -------------------------------------------------------------------------------
+
+    def reach(
+        self, goal: ArrayLike, *, max_steps: int = 0, timeout_s: float = 60.0
+    ) -> ReachResult:
+        """Drive to a goal and wait until that is over.
+
+        Args:
+            goal: See `send`.
+            max_steps: See `send`.
+            timeout_s: Longest wait, seconds; the goal is canceled then.
+
+        Raises:
+            NoAnswerError: If it takes longer.
+        """
+        sent = self.send(goal, max_steps=max_steps, timeout_s=timeout_s)
+        try:
+            return sent.result(timeout_s)
+        except NoAnswerError:
+            sent.cancel()
+            raise
+
+    def send(self, goal: ArrayLike, *, max_steps: int = 0, timeout_s: float = 10.0) -> 'SentGoal':
+        """Send a goal and return when the goal node has taken or refused it.
+
+        Args:
+            goal: Position (x, y) in metres, or a full goal observation, shape (obs_dim,).
+            max_steps: Control steps that it may take; 0 for the goal node's own limit.
+            timeout_s: Longest wait for the answer, seconds.
+
+        Raises:
+            NoAnswerError: If there is no answer.
+        """
+        values = to_floats(goal)
+        request = ReachGoal.Goal(
+            max_steps=max_steps, episode_id=self._episode_id, request_id=uuid.uuid4().hex
+        )
+        request.pose = PoseStamped()
+        request.pose.header.frame_id = self._frame_id
+        request.pose.pose.orientation.w = 1.0
+        if len(values) == 2:
+            request.pose.pose.position = to_point(values)
+        else:
+            request.goal = values
+        return self.send_request(request, timeout_s)
+
+    def send_request(self, request: ReachGoal.Goal, timeout_s: float = 10.0) -> 'SentGoal':
+        """Send an action goal as it is; its `request_id` has to be unique."""
+        self.wait(self._reach_goal.server_is_ready, 'action reach_goal', timeout_s)
+        self.wait(
+            lambda: self._refusals_from.get_publisher_count() > 0, 'topic episode', timeout_s
+        )
+        sent = SentGoal(self)
+        future = self._reach_goal.send_goal_async(request, feedback_callback=sent.on_feedback)
+        self.wait(future.done, 'the answer to a goal', timeout_s)
+        handle = future.result()
+        if handle.accepted:
+            sent.begin(handle)
+            return sent
+        self.wait(
+            lambda: request.request_id in self._refusals, 'why a goal was refused', timeout_s
+        )
+        event = self._refusals.pop(request.request_id)
+        sent.refuse(ReachResult(False, error_code=event.error_code, error_msg=event.reason))
+        return sent
+
+    def _on_event(self, message: EpisodeEvent) -> None:
+        if message.kind == EpisodeEvent.STARTED and message.episode_id != self._episode_id:
+            self._episode_id = 0  # somebody else began it
+        if message.kind == EpisodeEvent.GOAL_REJECTED and message.request_id:
+            self._refusals[message.request_id] = message
+
+    # --- services ----------------------------------------------------------------------------
+
+    def set_task(
+        self, task_id: int, seed: int = 0, *, send_goal: bool = False, timeout_s: float = 10.0
+    ) -> SetTask.Response:
+        """Put the robot at the start of an evaluation task; see SetTask for the answer."""
+        request = SetTask.Request(task_id=task_id, seed=seed, send_goal=send_goal)
+        response = self._call(self._set_task, request, timeout_s)
+        if response.success:
+            self._episode_id = response.episode_id
+        return response
+
+    def reset(self, timeout_s: float = 10.0) -> Trigger.Response:
+        """Begin an episode without a task, at a random place."""
+        self._episode_id = 0
+        return self._call(self._reset, Trigger.Request(), timeout_s)
+
+    def enable(self, enabled: bool, timeout_s: float = 10.0) -> SetBool.Response:
+        """Let the robot move, or make every action zero."""
+        return self._call(self._enable, SetBool.Request(data=enabled), timeout_s)
+
+    def _call(self, client: Client, request: Any, timeout_s: float) -> Any:
+        self.wait(client.service_is_ready, f'service {client.srv_name}', timeout_s)
+        future = client.call_async(request)
+        self.wait(future.done, f'the answer of {client.srv_name}', timeout_s)
+        return future.result()
+
+    # --- waiting -----------------------------------------------------------------------------
+
+    def wait(self, condition: Callable[[], Any], what: str, timeout_s: float) -> None:
+        """Take in messages until `condition` holds.
+
+        Raises:
+            NoAnswerError: If it does not hold within `timeout_s`; names `what`.
+        """
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            self._while_waiting()
+            if time.monotonic() > deadline:
+                raise NoAnswerError(f'no answer within {timeout_s:g} s: {what}')
+            self._spun.spin_once(timeout_sec=0.05)
+
+    def take_in(self) -> None:
+        """Take in a message that is there already."""
+        self._spun.spin_once(timeout_sec=0)
+
+    def destroy_node(self) -> None:
+        """Leave the graph."""
+        self._spun.remove_node(self)
+        self._reach_goal.destroy()
+        super().destroy_node()
+
+
+class SentGoal:
+    """A goal that was sent; made by `RobotCommander.send`.
+
+    Attributes:
+        feedback: The newest feedback, None before the first.
+    """
+
+    def __init__(self, commander: RobotCommander) -> None:
+        """Nothing is known yet."""
+        self.feedback: ReachGoal.Feedback | None = None
+        self._commander = commander
+        self._handle: ClientGoalHandle | None = None
+        self._answer: Future | None = None
+        self._result: ReachResult | None = None
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the goal node took it."""
+        return self._handle is not None
+
+    def is_done(self) -> bool:
+        """Whether the result is known; takes in waiting messages first."""
+        if self._result is None:
+            self._commander.take_in()
+        return self._result is not None
+
+    def result(self, timeout_s: float = 60.0) -> ReachResult:
+        """Wait for the result.
+
+        Raises:
+            NoAnswerError: If there is none within `timeout_s`.
+        """
+        self._commander.wait(lambda: self._result is not None, 'the goal', timeout_s)
+        assert self._result is not None
+        return self._result
+
+    def cancel(self, timeout_s: float = 10.0) -> bool:
+        """Ask to give the goal up; whether it was still under way. `result` says how it ended."""
+        if self._handle is None or self._result is not None:
+            return False
+        future = self._handle.cancel_goal_async()
+        self._commander.wait(future.done, 'the cancellation', timeout_s)
+        return bool(future.result().goals_canceling)
+
+    def on_feedback(self, message: Any) -> None:
+        """Called with every feedback message."""
+        self.feedback = message.feedback
+
+    def begin(self, handle: ClientGoalHandle) -> None:
+        """The goal was taken."""
+        self._handle = handle
+        self._answer = handle.get_result_async()
+        self._answer.add_done_callback(self._on_result)
+
+    def refuse(self, result: ReachResult) -> None:
+        """The goal was refused."""
+        self._result = result
+
+    def _on_result(self, future: Future) -> None:
+        result = future.result().result
+        self._result = ReachResult(
+            result.success, result.steps, result.seconds, result.error_code, result.error_msg
+        )
