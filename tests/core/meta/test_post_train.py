@@ -8,6 +8,7 @@ from metagcttt_core import (
     post_train,
     TrajectoryDataset,
 )
+from metagcttt_core.adaptation.batches import QueryBatches
 from metagcttt_core.agents import AGENTS
 from metagcttt_core.meta import tasks
 from metagcttt_core.meta.tasks import TaskSampler
@@ -165,6 +166,26 @@ def test_steps_are_reported_with_the_agent_as_it_is_then():
     )
     assert [step for step, _ in seen] == [1, 2, 3, 4]
     assert_bit_equal(trained, seen[-1][1])
+
+
+def test_every_outer_step_draws_other_tasks_and_batches(monkeypatch):
+    batches, sample = [], QueryBatches.sample
+
+    def spy(source, size, rng):
+        batches.append(sample(source, size, rng))
+        return batches[-1]
+
+    monkeypatch.setattr(QueryBatches, 'sample', spy)
+    drawn = []
+    post_train(
+        tiny_agent(),
+        random_dataset([60, 60]),
+        quick(meta_batch_size=2),
+        on_step=lambda outer, agent: drawn.extend(outer.tasks),
+    )
+    assert len({task.goal.tobytes() for task in drawn}) > 5
+    assert len(batches) == 4 * 2 * 3
+    assert len({batch['observations'].numpy().tobytes() for batch in batches}) == len(batches)
 
 
 def test_agent_with_a_critic_filters_with_its_current_value(monkeypatch):

@@ -2,6 +2,7 @@
 
 from metagcttt_core import CheckpointError, load_checkpoint, TrajectoryDataset
 from metagcttt_core.agents import AGENTS
+from metagcttt_core.data import GoalRelabeller
 from metagcttt_core.training.pretrain import pretrain, PretrainConfig
 from metagcttt_core.training.run import TrainingInterrupted, TrainingRun
 import numpy as np
@@ -56,6 +57,19 @@ def test_every_step_is_reported_with_its_losses():
         assert losses.keys() == {'loss', 'bc', 'mse'}
         assert losses['loss'] == losses['bc']
         assert not losses['loss'].requires_grad
+
+
+def test_every_step_draws_another_batch(monkeypatch):
+    batches, sample = [], GoalRelabeller.sample
+
+    def spy(relabeller, size, rng):
+        batches.append(sample(relabeller, size, rng))
+        return batches[-1]
+
+    monkeypatch.setattr(GoalRelabeller, 'sample', spy)
+    pretrain(tiny_agent(), random_dataset([50]), CONFIG)
+    assert len({batch['observations'].tobytes() for batch in batches}) == 5
+    assert len({batch['actor_goals'].tobytes() for batch in batches}) == 5
 
 
 def test_policy_learns_the_dataset_s_actions():
