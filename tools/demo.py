@@ -51,8 +51,10 @@ def main(argv: list[str] | None = None) -> None:
     settings = parse(DemoSettings, _DESCRIPTION, 'demo', argv)
     try:
         outcomes = run_arms(settings)
-    except (NodeFailedError, NoAnswerError) as error:
+    except (NodeFailedError, NoAnswerError, FileNotFoundError) as error:
         fail(str(error))
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None
     report(settings, outcomes)
 
 

@@ -1,15 +1,14 @@
 """Success of policies by test-time training budget, over tasks, episodes and seeds."""
 
-from collections.abc import Iterator
 from concurrent.futures import as_completed, ProcessPoolExecutor
 import json
 import multiprocessing
 from pathlib import Path
+import sys
 from typing import Any
 
 from metagcttt_core import (
     CheckpointError,
-    DatasetError,
     evaluate_success,
     FilterConfig,
     load_checkpoint,
@@ -27,12 +26,18 @@ from sim_bridge import make_simulator
 from tqdm import tqdm
 
 from tools.cli import fail, parse
+from tools.job_log import JobLog
 from tools.runs import provenance, use_threads
 
 _DESCRIPTION = """Success of policies by test-time training budget.
 
 Example: python -m tools.evaluate --checkpoints out/pretrain/checkpoint out/meta/checkpoint
-Prints a table with standard errors over seeds and writes OUT as JSON."""
+Prints a table with standard errors over seeds and writes OUT as JSON.
+Ctrl-C is safe: --resume goes on."""
+
+
+Job = tuple[str, str, int, int, int]
+"""Checkpoint, environment, budget, seed and task."""
 
 
 class EvaluateSettings(Settings):
@@ -53,6 +58,7 @@ class EvaluateSettings(Settings):
     seeds: tuple[int, ...] = Field((0, 1, 2), min_length=1, description='evaluation seeds')
     processes: int = Field(2, ge=1, description='processes to spread the work over')
     out: Path = Field(Path('out/evaluation.json'), description='file for the results')
+    resume: bool = Field(False, description='keep what an interrupted call finished')
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -60,8 +66,11 @@ def main(argv: list[str] | None = None) -> None:
     settings = parse(EvaluateSettings, _DESCRIPTION, 'evaluate', argv)
     try:
         results = evaluate(settings)
-    except (DatasetError, CheckpointError) as error:
+    except ValueError as error:
         fail(str(error))
+    except KeyboardInterrupt:
+        print('interrupted; the same command with --resume goes on', file=sys.stderr)
+        raise SystemExit(130) from None
     report = {'settings': settings.model_dump(mode='json'), **provenance(), 'results': results}
     with atomic_write(settings.out) as file:
         file.write((json.dumps(report, indent=2) + '\n').encode())
@@ -71,7 +80,7 @@ def main(argv: list[str] | None = None) -> None:
 
 def evaluate(settings: EvaluateSettings) -> list[dict[str, Any]]:
     """Success by policy and budget: rates per seed, their mean and error, and the AUC."""
-    environments = [load_checkpoint(path).metadata['environment'] for path in settings.checkpoints]
+    environments = [_environment(path) for path in settings.checkpoints]
     num_tasks = make_simulator(environments[0]).spec.num_tasks
     jobs = [
         (str(path), environment, budget, seed, task)
@@ -80,7 +89,7 @@ def evaluate(settings: EvaluateSettings) -> list[dict[str, Any]]:
         for seed in settings.seeds
         for task in range(1, num_tasks + 1)
     ]
-    rates = dict(_run_jobs(settings, jobs))
+    rates = _run_jobs(settings, jobs)
     results = []
     for path, environment in zip(settings.checkpoints, environments, strict=True):
         curve = []
@@ -121,21 +130,35 @@ def format_table(results: list[dict[str, Any]]) -> str:
     return '\n'.join(lines)
 
 
-def _run_jobs(
-    settings: EvaluateSettings, jobs: list[tuple[str, str, int, int, int]]
-) -> Iterator[tuple[tuple[str, str, int, int, int], float]]:
-    """Success rate of every job, as they finish; jobs run in separate processes."""
+def _run_jobs(settings: EvaluateSettings, jobs: list[Job]) -> dict[Job, float]:
+    """Success rate of every job; jobs run in separate processes and are kept as they finish."""
+    decisive = settings.model_dump(mode='json', exclude={'processes', 'out', 'resume'})
+    path = settings.out.with_suffix('.partial.jsonl')
+    log: JobLog[Job] = JobLog(path, decisive, resume=settings.resume)
     pool = ProcessPoolExecutor(
         settings.processes,
         mp_context=multiprocessing.get_context('spawn'),
         initializer=_start_worker,
         initargs=(settings,),
     )
-    with pool, tqdm(total=len(jobs), unit='job', desc='evaluate') as bar:
-        futures = {pool.submit(_success_rate, job): job for job in jobs}
-        for future in as_completed(futures):
-            yield futures[future], future.result()
-            bar.update()
+    todo = [job for job in jobs if job not in log.finished]
+    with tqdm(total=len(jobs), initial=len(jobs) - len(todo), unit='job', desc='evaluate') as bar:
+        try:
+            futures = {pool.submit(_success_rate, job): job for job in todo}
+            for future in as_completed(futures):
+                log.add(futures[future], future.result())
+                bar.update()
+        finally:
+            pool.shutdown(cancel_futures=True)
+    log.remove()
+    return log.finished
+
+
+def _environment(checkpoint: Path) -> str:
+    environment = load_checkpoint(checkpoint).metadata.get('environment')
+    if environment is None:
+        raise CheckpointError(f'{checkpoint}: does not say which environment it is for')
+    return environment
 
 
 class _Worker:
@@ -153,7 +176,7 @@ def _start_worker(settings: EvaluateSettings) -> None:
     )
 
 
-def _success_rate(job: tuple[str, str, int, int, int]) -> float:
+def _success_rate(job: Job) -> float:
     path, environment, budget, seed, task = job
     simulator = make_simulator(environment)
     result = evaluate_success(

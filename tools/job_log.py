@@ -1,0 +1,60 @@
+"""Results of many small jobs, kept as they come so that an interrupted tool can go on."""
+
+import json
+from pathlib import Path
+from typing import Any, cast, Generic, TypeVar
+
+Job = TypeVar('Job', bound=tuple[Any, ...])
+
+
+class JobLog(Generic[Job]):
+    """A JSON-lines file of finished jobs; the first line holds the settings that decide them."""
+
+    def __init__(self, path: Path, settings: dict[str, Any], *, resume: bool) -> None:
+        """Open the log.
+
+        Args:
+            path: The file; its folder is made if missing.
+            settings: What decides the results.
+            resume: Keep what an earlier call for the same settings finished.
+
+        Raises:
+            ValueError: If the file is of other settings; names the first that differs.
+        """
+        self._path = path
+        self.finished: dict[Job, float] = {}
+        if resume and path.exists():
+            self._read(settings)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lines: list[dict[str, Any]] = [{'settings': settings}]
+        lines += [{'job': job, 'result': result} for job, result in self.finished.items()]
+        self._file = path.open('w', encoding='utf-8')
+        self._write(*lines)
+
+    def add(self, job: Job, result: float) -> None:
+        """Keep the result of a job."""
+        self.finished[job] = result
+        self._write({'job': job, 'result': result})
+
+    def remove(self) -> None:
+        """Delete the file, once the results are kept elsewhere."""
+        self._file.close()
+        self._path.unlink()
+
+    def _write(self, *lines: dict[str, Any]) -> None:
+        self._file.writelines(json.dumps(line) + '\n' for line in lines)
+        self._file.flush()
+
+    def _read(self, settings: dict[str, Any]) -> None:
+        header, *lines = self._path.read_text(encoding='utf-8').splitlines(keepends=True)
+        kept = json.loads(header)['settings']
+        for name in sorted(kept.keys() | settings.keys()):
+            if kept.get(name) != settings.get(name):
+                raise ValueError(
+                    f'{self._path}: cannot resume, {name} was {kept.get(name)!r} '
+                    f'and is now {settings.get(name)!r}'
+                )
+        for line in lines:
+            if line.endswith('\n'):  # a kill can leave the last line unfinished
+                entry = json.loads(line)
+                self.finished[cast(Job, tuple(entry['job']))] = entry['result']
