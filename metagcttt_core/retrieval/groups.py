@@ -26,9 +26,10 @@ def smallest_per_episode(episodes: np.ndarray, rows: np.ndarray, values: np.ndar
     """
     if not len(rows):
         return Best(episodes, rows, values)
+    keys = values.astype(np.float64)  # of one type with `smallest`, else numpy casts one by one
     smallest = np.full(episodes.max() + 1, np.inf)
-    np.minimum.at(smallest, episodes, values)
-    hits = np.flatnonzero(values == smallest[episodes])
+    np.minimum.at(smallest, episodes, keys)
+    hits = np.flatnonzero(keys == smallest[episodes])
     hits = hits[np.argsort(rows[hits])]  # few: one per trajectory, and ties
     firsts = hits[np.flatnonzero(np.diff(episodes[hits], prepend=-1))]
     return Best(episodes[firsts], rows[firsts], values[firsts])

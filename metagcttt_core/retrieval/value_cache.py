@@ -38,10 +38,11 @@ class ValueCache:
             ValueError: If `value_fn` returns another shape or a non-finite value.
         """
         known = self._known(value_fn, goal)
-        unknown = rows[np.isnan(known[rows])]
+        values = known[rows]
+        unknown = rows[np.isnan(values)]
         for start in range(0, len(unknown), _BATCH_ROWS):
             self._evaluate(value_fn, goal, known, unknown[start : start + _BATCH_ROWS])
-        return known[rows]
+        return known[rows] if len(unknown) else values
 
     def prefetch(
         self,
