@@ -1,3 +1,4 @@
+from importlib.metadata import distribution
 import os
 from pathlib import Path
 import shutil
@@ -6,7 +7,7 @@ import subprocess
 import pytest
 
 ROS2RUN = Path(__file__).parents[2] / 'tools' / 'ros2run'
-NODES = 'goal_node, policy_node, sim_bridge_node'
+NODES = ', '.join(sorted(distribution('metagcttt').entry_points.names))
 
 
 @pytest.fixture
