@@ -31,7 +31,7 @@ def constant(value: float, name: str = 'gcbc'):
 
 
 def expert_of(agent, best_step: int = 1, test_batch=None) -> Expert:
-    return Expert(InnerLoopResult(agent, [0.0], [0.0], best_step), test_batch)
+    return Expert(InnerLoopResult(agent, [0.0], [0.0], best_step), test_batch, lambda: [])
 
 
 def held_out_batch(agent, seed: int = 0):

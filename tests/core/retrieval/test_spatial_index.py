@@ -21,7 +21,7 @@ def ascending(near):
     return near.rows[order], near.distances[order]
 
 
-@settings(max_examples=300)
+@settings(max_examples=3 * settings().max_examples)
 @given(
     seed=st.integers(0, 10_000),
     dims=st.sampled_from([(0,), (1,), (0, 1), (2, 0), (0, 1, 2), (3, 1, 0, 2)]),

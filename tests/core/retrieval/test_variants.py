@@ -14,7 +14,7 @@ from tests.core.builders import DATA, dataset_at, terminals_of
 from tests.core.retrieval import reference
 from tests.core.retrieval.reference import Answer
 
-MANY_EXAMPLES = settings(max_examples=200)
+MANY_EXAMPLES = settings(max_examples=2 * settings().max_examples)
 
 
 @dataclass
