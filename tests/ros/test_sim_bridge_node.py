@@ -1,3 +1,5 @@
+import time
+
 from metagcttt.sim_bridge_node import SimBridgeNode
 from metagcttt_interfaces.msg import ActionCommand, EpisodeEvent
 from nav_msgs.msg import OccupancyGrid
@@ -6,7 +8,7 @@ import pytest
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from sim_bridge import make_simulator
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 
 from tests.ros.graph import ANY, EVERY, Graph, Record
 
@@ -164,6 +166,69 @@ def test_speed_factor_applies_at_once(graph: Graph) -> None:
     [result] = node.set_parameters([Parameter('speed_factor', value=50.0)])
     assert result.successful
     graph.wait(lambda: len(states) > 3, 'states at the new pace', timeout_s=5)
+
+
+def pause(graph: Graph, paused: bool) -> str:
+    response = graph.call(SetBool, 'pause', SetBool.Request(data=paused))
+    assert response.success
+    return response.message
+
+
+def test_paused_world_moves_by_single_steps_only(graph: Graph) -> None:
+    graph.add(SimBridgeNode, speed_factor=20.0)
+    states = Record(graph, ANY).states
+    clocks = graph.collect(Clock, '/clock', ANY)
+    graph.set_task(1)
+    graph.wait(lambda: states and states[-1].step > 3, 'a few steps')
+    assert not graph.call(Trigger, 'step', Trigger.Request()).success
+    assert pause(graph, True).startswith('paused, step')
+    count = len(states)
+    graph.wait(lambda: len(states) > count + 5, 'the state that is published on')
+    stopped = states[-1]
+    graph.publish('action', answer(stopped, (1.0, 0.0)))
+    graph.wait(lambda: len(states) > count + 10, 'more of the same')
+    assert {(s.step, seconds(s.header.stamp)) for s in states[-8:]} == {
+        (stopped.step, seconds(stopped.header.stamp))
+    }
+    assert seconds(clocks[-1].clock) == pytest.approx(seconds(stopped.header.stamp))
+    for number in range(1, 4):
+        response = graph.call(Trigger, 'step', Trigger.Request())
+        assert response.success
+        assert response.message == f'step {stopped.step + number} of episode 2'
+    graph.wait(lambda: states[-1].step == stopped.step + 3, 'three steps')
+    elapsed = seconds(states[-1].header.stamp) - seconds(stopped.header.stamp)
+    assert elapsed == pytest.approx(0.3)
+    assert states[-1].position.x > stopped.position.x
+    assert pause(graph, False).startswith('runs, step')
+    graph.wait(lambda: states[-1].step > stopped.step + 6, 'the world to go on')
+
+
+def test_paused_lockstep_keeps_the_action_until_the_step(graph: Graph) -> None:
+    graph.add(SimBridgeNode, stepping='lockstep', start_paused=True)
+    states = Record(graph, EVERY).states
+    graph.wait(lambda: states, 'the first state')
+    early = graph.call(Trigger, 'step', Trigger.Request())
+    assert (early.success, early.message) == (
+        False,
+        'no action has arrived for step 0 of episode 1',
+    )
+    graph.publish('action', answer(states[0]))
+    graph.wait(lambda: graph.call(Trigger, 'step', Trigger.Request()).success, 'the step')
+    graph.wait(lambda: states[-1].step == 1, 'the state')
+    graph.publish('action', answer(states[-1]))
+    assert not any(state.step > 1 for state in states)
+    pause(graph, False)
+    graph.wait(lambda: states[-1].step == 2, 'the action that waited')
+
+
+def test_pace_keeps_to_the_clock_of_the_wall(graph: Graph) -> None:
+    graph.add(SimBridgeNode, speed_factor=10.0)
+    clocks = graph.collect(Clock, '/clock', ANY)
+    graph.wait(lambda: clocks, 'the clock')
+    began, first = time.monotonic(), seconds(clocks[-1].clock)
+    graph.wait(lambda: time.monotonic() - began > 3.0, 'three seconds')
+    # Half a second of delay by other programs is made up for; the rest may be one step.
+    assert seconds(clocks[-1].clock) - first == pytest.approx(30.0, rel=0.02)
 
 
 def test_unknown_environment_is_refused_with_the_nearest(graph: Graph) -> None:

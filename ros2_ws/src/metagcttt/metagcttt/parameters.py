@@ -77,6 +77,7 @@ SIM_BRIDGE_NODE = (
     ),
     Parameter('publish_clock', True, 'publish the simulated time on /clock'),
     Parameter('seed', 0, 'seed of the first episode', minimum=0, maximum=2**32 - 1),
+    Parameter('start_paused', False, 'stand still until the service pause says otherwise'),
 )
 
 POLICY_NODE = (

@@ -1,5 +1,6 @@
 """The node that owns a simulator."""
 
+import time
 from typing import Any
 
 from metagcttt_interfaces.msg import ActionCommand, EpisodeEvent, MazeState
@@ -14,7 +15,7 @@ from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sim_bridge import make_simulator, StepResult
 from std_msgs.msg import Header
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 
 from metagcttt.converters import (
     occupancy_grid,
@@ -24,6 +25,7 @@ from metagcttt.converters import (
     to_point,
     to_time,
 )
+from metagcttt.pacing import Pacer
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import SIM_BRIDGE_NODE
 from metagcttt.qos import COMMAND, EVENTS, LATCHED, SENSOR, state_profile
@@ -35,7 +37,9 @@ class SimBridgeNode(Node):
 
     In `realtime` it steps by itself, with the newest action or, when that is too old, with zero.
     In `lockstep` it publishes a state and stands still until the action for that very state
-    arrives. After a task episode has ended nothing moves until the next reset.
+    arrives. After a task episode has ended nothing moves until the next reset. While it is paused
+    nothing moves but by the service `step`; in realtime the last state is published on, so that
+    nobody takes the simulator for dead.
 
     The header of a state carries simulated time, which starts at 0 with the node and never goes
     back; `/clock` carries the same.
@@ -62,6 +66,8 @@ class SimBridgeNode(Node):
         self._last = StepResult(np.zeros(spec.obs_dim), False, False, False)
         self._action = np.zeros(spec.act_dim)
         self._action_time_ns = 0
+        self._paused = bool(self._settings['start_paused'])
+        self._awaiting: NDArray[np.float64] | None = None  # lockstep: arrived while paused
 
         profile = state_profile(self._settings['stepping'])
         self._states = self.create_publisher(MazeState, 'state', profile)
@@ -73,6 +79,8 @@ class SimBridgeNode(Node):
         self.create_subscription(ActionCommand, 'action', self._on_action, COMMAND)
         self.create_service(Trigger, 'reset', self._on_reset)
         self.create_service(SetTask, 'set_task', self._on_set_task)
+        self.create_service(SetBool, 'pause', self._on_pause)
+        self.create_service(Trigger, 'step', self._on_step)
         self.add_post_set_parameters_callback(self._on_parameters_set)
 
         self._map.publish(occupancy_grid(self._simulator.maze, self._header()))
@@ -82,6 +90,7 @@ class SimBridgeNode(Node):
         )
         self._begin(self._simulator.reset_free(self._settings['seed']), self._settings['seed'])
         self._timer: Timer | None = None
+        self._pacer = Pacer(spec.control_period_s, time.monotonic())
         self._pace()
 
     def destroy_node(self) -> None:
@@ -90,12 +99,13 @@ class SimBridgeNode(Node):
         super().destroy_node()
 
     def _pace(self) -> None:
-        """(Re)start the timer that steps the world in realtime."""
+        """(Re)start the timer that steps the world in realtime, and the count of its steps."""
         if self._lockstep:
             return
         if self._timer is not None:
             self.destroy_timer(self._timer)
         period_s = self._simulator.spec.control_period_s / self._settings['speed_factor']
+        self._pacer = Pacer(period_s, time.monotonic())
         # Not the node's clock: that one may be the simulated time made here.
         self._timer = self.create_timer(
             period_s, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME)
@@ -108,6 +118,20 @@ class SimBridgeNode(Node):
     # --- time passes -------------------------------------------------------------------------
 
     def _on_tick(self) -> None:
+        if self._paused:
+            self._publish_state()
+            return
+        lost = self._pacer.num_lost
+        for _ in range(self._pacer.due(time.monotonic())):
+            self._advance_realtime()
+        if self._pacer.num_lost > lost:
+            self.get_logger().warning(
+                f'too slow for speed_factor {self._settings["speed_factor"]:g}: '
+                f'{self._pacer.num_lost - lost} steps were left out',
+                throttle_duration_sec=5.0,
+            )
+
+    def _advance_realtime(self) -> None:
         age_s = (self._time_ns - self._action_time_ns) / 1e9
         fresh = age_s <= self._settings['action_timeout_s']
         self._advance(self._action if fresh else np.zeros_like(self._action))
@@ -130,10 +154,46 @@ class SimBridgeNode(Node):
         fault = vector_fault('the action', values, self._simulator.spec.act_dim)
         if fault:
             self.get_logger().warning(f'ignored: {fault}', throttle_duration_sec=5.0)
+        elif self._lockstep and self._paused:
+            self._awaiting = values
         elif self._lockstep:
             self._advance(values)
         else:
             self._action, self._action_time_ns = values, self._time_ns
+
+    # --- time stands still -------------------------------------------------------------------
+
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        was, self._paused = self._paused, request.data
+        if was and not self._paused:
+            self._pace()
+            self._advance_awaiting()
+        response.success = True
+        response.message = f'{"paused" if self._paused else "runs"}, {self._where()}'
+        return response
+
+    def _on_step(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if not self._paused:
+            response.message = 'the simulation runs: pause it first'
+        elif not self._lockstep:
+            self._advance_realtime()
+            response.success = True
+        elif self._advance_awaiting():
+            response.success = True
+        else:
+            response.message = f'no action has arrived for {self._where()}'
+        response.message = response.message or self._where()
+        return response
+
+    def _advance_awaiting(self) -> bool:
+        """Take the lockstep action that arrived while paused; false when there is none."""
+        values, self._awaiting = self._awaiting, None
+        if values is not None:
+            self._advance(values)
+        return values is not None
+
+    def _where(self) -> str:
+        return f'step {self._step} of episode {self._episode_id}'
 
     # --- episodes begin ----------------------------------------------------------------------
 
@@ -173,6 +233,7 @@ class SimBridgeNode(Node):
         self._step = 0
         self._last = StepResult(observation, False, False, False)
         self._action = np.zeros_like(self._action)
+        self._awaiting = None
         self._events.publish(
             EpisodeEvent(
                 header=self._header(),
