@@ -7,7 +7,7 @@ from pydantic import Field
 from metagcttt_core.adaptation.config import InnerLoopConfig
 from metagcttt_core.retrieval.config import FilterConfig
 
-Algorithm = Literal['continual', 'fomaml', 'reptile']
+Algorithm = Literal['continual', 'fomaml', 'reptile', 'maml']
 
 
 class MetaConfig(InnerLoopConfig):
@@ -20,7 +20,7 @@ class MetaConfig(InnerLoopConfig):
     meta_lr: float = Field(
         3e-4,
         gt=0,
-        description='beta: rate of the outer Adam (fomaml), merging coefficient (reptile)',
+        description='beta: rate of the outer Adam (fomaml, maml), merging coefficient (reptile)',
     )
     meta_batch_size: int = Field(1, ge=1, description='tasks per outer step B')
     filter: FilterConfig = FilterConfig()

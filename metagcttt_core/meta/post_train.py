@@ -1,6 +1,7 @@
 """Meta-post-training (paper, Algorithm 1): prepare a policy for test-time training."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 
 from metagcttt_core.adaptation.batches import QueryBatches
 from metagcttt_core.adaptation.inner_loop import InnerLoopResult, run_inner_loop
-from metagcttt_core.agents.agent import Agent
+from metagcttt_core.agents.agent import Agent, TensorBatch
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.meta.config import MetaConfig
 from metagcttt_core.meta.tasks import MetaTask, TaskSampler
@@ -96,12 +97,17 @@ def adapt_to_task(
         for split in (task.train, task.test)
     )
     test_batch = test.all(rng)
+
+    def train_batches(rng: np.random.Generator) -> Iterator[TensorBatch]:
+        return (train.sample(config.batch_size, rng) for _ in range(config.inner_steps))
+
+    before = copy.deepcopy(rng)
     result = run_inner_loop(
         base,
-        (train.sample(config.batch_size, rng) for _ in range(config.inner_steps)),
+        train_batches(rng),
         lr=config.inner_lr,
         optimizer=config.optimizer,
         test_batch=test_batch if config.early_stopping else None,
         actor_only=config.actor_only,
     )
-    return Expert(result, test_batch)
+    return Expert(result, test_batch, lambda: train_batches(copy.deepcopy(before)))

@@ -4,22 +4,31 @@ Each takes the base agent, changed in place, and one `Expert` per task of the me
 one is a function and a line in `META_UPDATES`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 import torch
 
 from metagcttt_core.adaptation.inner_loop import InnerLoopResult
 from metagcttt_core.agents.agent import Agent, TensorBatch
 from metagcttt_core.meta.config import MetaConfig
+from metagcttt_core.meta.second_order import meta_gradient
 
 
 @dataclass(frozen=True)
 class Expert:
-    """The outcome of one task's inner loop and the test batch that scores it."""
+    """The outcome of one task's inner loop.
+
+    Attributes:
+        result: The adapted copy and its losses.
+        test_batch: What scores the copy.
+        train_batches: Draws the batches of the inner steps once more.
+    """
 
     result: InnerLoopResult
     test_batch: TensorBatch
+    train_batches: Callable[[], Iterable[TensorBatch]]
 
 
 MetaUpdate = Callable[[Agent, Sequence[Expert], MetaConfig, torch.optim.Optimizer | None], None]
@@ -56,28 +65,64 @@ def fomaml(
     optimizer: torch.optim.Optimizer | None = None,
 ) -> None:
     """TT-FOMAML: step theta with the mean test-loss gradient taken at the adapted weights."""
-    if optimizer is None:
-        raise ValueError('fomaml needs an outer optimizer')
-    parameters = list(base.trained_parameters(actor_only=config.actor_only))
-    means = [torch.zeros_like(parameter) for parameter in parameters]
-    for expert in experts:
+
+    def gradient(expert: Expert) -> Sequence[torch.Tensor]:
         adapted = list(expert.result.agent.trained_parameters(actor_only=config.actor_only))
         loss, _ = expert.result.agent.losses(expert.test_batch, actor_only=config.actor_only)
-        gradients = torch.autograd.grad(loss, adapted)
-        for mean, gradient in zip(means, gradients, strict=True):
-            mean += gradient / len(experts)
-    for parameter, mean in zip(parameters, means, strict=True):
-        parameter.grad = mean
-    optimizer.step()
+        return torch.autograd.grad(loss, adapted)
+
+    _step_down_the_mean(gradient, base, experts, config, optimizer)
+
+
+def maml(
+    base: Agent,
+    experts: Sequence[Expert],
+    config: MetaConfig,
+    optimizer: torch.optim.Optimizer | None = None,
+) -> None:
+    """MAML: as TT-FOMAML, with the gradient taken through the inner steps (an extension)."""
+
+    def gradient(expert: Expert) -> Sequence[torch.Tensor]:
+        return meta_gradient(
+            base,
+            islice(expert.train_batches(), expert.result.best_step),
+            expert.test_batch,
+            lr=config.inner_lr,
+            optimizer=config.optimizer,
+            actor_only=config.actor_only,
+        )
+
+    _step_down_the_mean(gradient, base, experts, config, optimizer)
 
 
 META_UPDATES: dict[str, MetaUpdate] = {
     'continual': continual,
     'fomaml': fomaml,
     'reptile': reptile,
+    'maml': maml,
 }
-GRADIENT_UPDATES = frozenset({'fomaml'})
+GRADIENT_UPDATES = frozenset({'fomaml', 'maml'})
 """Updates that step through the outer Adam, with learning rate beta."""
+
+
+def _step_down_the_mean(
+    gradient: Callable[[Expert], Sequence[torch.Tensor]],
+    base: Agent,
+    experts: Sequence[Expert],
+    config: MetaConfig,
+    optimizer: torch.optim.Optimizer | None,
+) -> None:
+    """Step the base with the mean of the experts' gradients."""
+    if optimizer is None:
+        raise ValueError(f'{config.algorithm} needs an outer optimizer')
+    parameters = list(base.trained_parameters(actor_only=config.actor_only))
+    means = [torch.zeros_like(parameter) for parameter in parameters]
+    for expert in experts:
+        for mean, part in zip(means, gradient(expert), strict=True):
+            mean += part / len(experts)
+    for parameter, mean in zip(parameters, means, strict=True):
+        parameter.grad = mean
+    optimizer.step()
 
 
 def _mean_weight(experts: Sequence[Expert], name: str) -> torch.Tensor:

@@ -88,7 +88,7 @@ def test_missing_dataset_is_one_line(tmp_path, capsys):
     assert 'none.npz: no such file' in capsys.readouterr().err
 
 
-@pytest.mark.parametrize('algorithm', ['continual', 'fomaml', 'reptile'])
+@pytest.mark.parametrize('algorithm', ['continual', 'fomaml', 'reptile', 'maml'])
 def test_meta_train_changes_the_policy_and_keeps_its_history(
     algorithm, dataset_path, base, tmp_path
 ):

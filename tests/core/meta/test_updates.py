@@ -189,7 +189,8 @@ def test_fomaml_of_the_actor_alone_leaves_the_critics():
 def test_fomaml_without_an_outer_optimizer_is_refused():
     base = tiny_agent()
     with pytest.raises(ValueError, match='fomaml needs an outer optimizer'):
-        fomaml(base, [expert_of(base.clone(), test_batch=held_out_batch(base))], CONFIG, None)
+        expert = expert_of(base.clone(), test_batch=held_out_batch(base))
+        fomaml(base, [expert], CONFIG.model_copy(update={'algorithm': 'fomaml'}), None)
 
 
 def test_rejected_fomaml_inner_loop_takes_the_gradient_at_the_base():
