@@ -72,7 +72,7 @@ def run_arms(settings: DemoSettings) -> dict[str, list[GoalOutcome]]:
         logs = settings.out / 'logs'
         nodes = [
             NodeProcess('sim_bridge_node', {'stepping': 'lockstep'}, logs / 'sim_bridge_node.log'),
-            NodeProcess('goal_node', {}, logs / 'goal_node.log'),
+            NodeProcess('goal_node', {'stepping': 'lockstep'}, logs / 'goal_node.log'),
         ]
         for node in nodes:
             stack.enter_context(node)
@@ -182,10 +182,14 @@ def own_domain() -> Iterator[None]:
     if 'ROS_DOMAIN_ID' in os.environ:
         yield
         return
-    with domain_id() as number:
-        os.environ['ROS_DOMAIN_ID'] = str(number)
+    # Left by hand: its own `with` block would take an OSError from the body for a taken domain.
+    reservation = domain_id()
+    os.environ['ROS_DOMAIN_ID'] = str(reservation.__enter__())
+    try:
         yield
+    finally:
         del os.environ['ROS_DOMAIN_ID']
+        reservation.__exit__(None, None, None)
 
 
 if __name__ == '__main__':
