@@ -1,75 +1,212 @@
-"""The launch file, run with recorders in the place of launch and launch_ros.
+"""The launch files, run with recorders in the place of launch and launch_ros.
 
 The wheels have neither, so this cannot start anything; with the real ones `ros2 launch ...
---show-args` does.
+--show-args` does. What the files would start runs as real processes in test_two_robots.
 """
 
+from collections.abc import Callable, Iterator
 from pathlib import Path
 import runpy
 import sys
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
+from typing import Any
 
+from lifecycle_msgs.msg import Transition
 from metagcttt.parameters import TABLES
 import pytest
 import yaml
 
 PACKAGE = Path(__file__).parents[2] / 'ros2_ws' / 'src' / 'metagcttt'
-
-
+FILES = ('lifecycle', 'metagcttt', 'two_robots')
 OPTIONAL = {'recorder_node', 'visualization_node'}
 
 
 class Recorder:
     """Stands for any class of launch: remembers what it was made with."""
 
-    def __init__(self, *args, **kwargs) -> None:
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.args, self.kwargs = args, kwargs
+
+    @property
+    def kind(self) -> str:
+        return type(self).__name__
 
 
 NAMES = {
     'launch': ['LaunchDescription'],
-    'launch.actions': ['DeclareLaunchArgument', 'SetEnvironmentVariable'],
-    'launch.substitutions': ['EnvironmentVariable', 'LaunchConfiguration', 'PathJoinSubstitution'],
+    'launch.actions': [
+        'DeclareLaunchArgument',
+        'EmitEvent',
+        'GroupAction',
+        'IncludeLaunchDescription',
+        'RegisterEventHandler',
+        'SetEnvironmentVariable',
+        'Shutdown',
+    ],
+    'launch.conditions': ['IfCondition'],
+    'launch.events': [],
+    'launch.events.matchers': ['matches_action'],
+    'launch.launch_description_sources': ['PythonLaunchDescriptionSource'],
+    'launch.substitutions': [
+        'EnvironmentVariable',
+        'LaunchConfiguration',
+        'NotEqualsSubstitution',
+        'PathJoinSubstitution',
+    ],
     'launch_ros': [],
     'launch_ros.actions': ['LifecycleNode', 'Node'],
+    'launch_ros.event_handlers': ['OnStateTransition'],
+    'launch_ros.events': [],
+    'launch_ros.events.lifecycle': ['ChangeState'],
     'launch_ros.parameter_descriptions': ['ParameterValue'],
     'launch_ros.substitutions': ['FindPackageShare'],
 }
 
 
+class Launched:
+    """What a launch file describes."""
+
+    def __init__(self, entities: list[Recorder]) -> None:
+        self.entities = [inner for entity in entities for inner in _inside(entity)]
+        self.arguments = {
+            e.args[0]: e.kwargs for e in entities if e.kind == 'DeclareLaunchArgument'
+        }
+        self.nodes = {
+            e.kwargs['executable']: e for e in entities if e.kind in ('Node', 'LifecycleNode')
+        }
+
+    def of_kind(self, kind: str) -> list[Recorder]:
+        return [entity for entity in self.entities if entity.kind == kind]
+
+
+def _inside(entity: Recorder) -> Iterator[Recorder]:
+    """An entity and those in a group."""
+    yield entity
+    if entity.kind == 'GroupAction':
+        for inner in entity.args[0]:
+            yield from _inside(inner)
+
+
 @pytest.fixture
-def launched(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
-    """The arguments and nodes of the launch file."""
+def launch(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Launched]:
+    """Runs a launch file."""
     for module, classes in NAMES.items():
         fake = ModuleType(module)
         for name in classes:
             setattr(fake, name, type(name, (Recorder,), {}))
         monkeypatch.setitem(sys.modules, module, fake)
-    names = runpy.run_path(str(PACKAGE / 'launch' / 'metagcttt.launch.py'))
-    [entities] = names['generate_launch_description']().args
-    return SimpleNamespace(
-        arguments={a.args[0]: a.kwargs for a in entities if 'description' in a.kwargs},
-        nodes={e.kwargs['executable']: e for e in entities if 'executable' in e.kwargs},
-    )
+
+    def run(name: str) -> Launched:
+        names = runpy.run_path(str(PACKAGE / 'launch' / f'{name}.launch.py'))
+        [entities] = names['generate_launch_description']().args
+        return Launched(entities)
+
+    return run
 
 
-def test_every_argument_is_described_and_finite_ones_list_their_values(launched) -> None:
-    assert all(argument['description'] for argument in launched.arguments.values())
-    listed = {name for name, argument in launched.arguments.items() if 'choices' in argument}
-    assert listed == {'stepping', 'autostart', 'use_sim_time', 'log_level'}
+def given_arguments(include: Recorder) -> dict[str, Any]:
+    return dict(include.kwargs['launch_arguments'])
 
 
-def test_all_nodes_start_under_their_names(launched) -> None:
-    assert launched.nodes.keys() == TABLES.keys() - OPTIONAL
-    assert all(node.kwargs['name'] == name for name, node in launched.nodes.items())
-    assert type(launched.nodes['policy_node']).__name__ == 'LifecycleNode'
+@pytest.mark.parametrize(
+    ('file', 'finite'),
+    [
+        ('lifecycle', {'stepping'}),
+        (
+            'metagcttt',
+            {
+                'stepping',
+                'autostart',
+                'use_sim_time',
+                'log_level',
+                'policy',
+                'visualize',
+                'rviz',
+            },
+        ),
+        ('two_robots', {'stepping', 'visualize', 'log_level'}),
+    ],
+)
+def test_arguments_are_described_and_finite_ones_list_their_values(
+    launch, file: str, finite: set[str]
+) -> None:
+    arguments = launch(file).arguments
+    assert all(argument['description'] for argument in arguments.values())
+    assert {name for name, argument in arguments.items() if 'choices' in argument} == finite
+    for name in finite:
+        assert arguments[name]['default_value'] in arguments[name]['choices']
 
 
-def test_parameters_given_by_launch_exist(launched) -> None:
-    for name, node in launched.nodes.items():
-        known = {parameter.name for parameter in TABLES[name]} | {'use_sim_time'}
+@pytest.mark.parametrize('file', FILES)
+def test_every_configuration_that_is_used_is_declared(launch, file: str) -> None:
+    text = (PACKAGE / 'launch' / f'{file}.launch.py').read_text(encoding='utf-8')
+    launched = launch(file)
+    for line in text.splitlines():
+        if "LaunchConfiguration('" in line:
+            assert line.split("LaunchConfiguration('")[1].split("'")[0] in launched.arguments
+
+
+def test_one_robot_has_all_nodes_under_their_names(launch) -> None:
+    nodes = launch('metagcttt').nodes
+    assert nodes.keys() == TABLES.keys() | {'rviz2'}
+    assert all(node.kwargs['name'] == name for name, node in nodes.items())
+    assert nodes['policy_node'].kind == 'LifecycleNode'
+    conditional = {name for name, node in nodes.items() if 'condition' in node.kwargs}
+    assert conditional == OPTIONAL | {'rviz2', 'policy_node'}
+
+
+def test_rviz_is_given_the_topics_of_the_namespace(launch) -> None:
+    rviz = launch('metagcttt').nodes['rviz2']
+    file = yaml.safe_load((PACKAGE / 'rviz' / 'metagcttt.rviz').read_text(encoding='utf-8'))
+    manager = file['Visualization Manager']
+    shown = {part['Topic']['Value'] for part in manager['Displays'] + manager['Tools'][2:]}
+    assert {name for name, _ in rviz.kwargs['remappings']} == shown
+    assert all(name == f'/{relative}' for name, relative in rviz.kwargs['remappings'])
+
+
+def test_two_robots_have_namespaces_and_clocks_of_their_own(launch) -> None:
+    two, one = launch('two_robots'), launch('metagcttt')
+    groups = two.of_kind('GroupAction')
+    includes = two.of_kind('IncludeLaunchDescription')
+    assert len(groups) == len(includes) == 2
+    given = [given_arguments(include) for include in includes]
+    assert [arguments['namespace'] for arguments in given] == ['robot1', 'robot2']
+    for arguments in given:
+        assert arguments.keys() <= one.arguments.keys()
+        assert arguments['clock_topic'] == 'clock'
+
+
+def test_lifecycle_is_driven_in_order_and_failure_ends_everything(launch) -> None:
+    launched = launch('lifecycle')
+    [include] = launched.of_kind('IncludeLaunchDescription')
+    assert given_arguments(include)['policy'] == 'false'
+    assert given_arguments(include).keys() <= launch('metagcttt').arguments.keys()
+    assert launched.nodes.keys() == {'policy_node'}
+    assert launched.nodes['policy_node'].kwargs['parameters'][1]['autostart'] is False
+    handlers = [handler.args[0].kwargs for handler in launched.of_kind('RegisterEventHandler')]
+    succeeded, failed = handlers
+    assert (succeeded['start_state'], succeeded['goal_state']) == ('configuring', 'inactive')
+    assert transition(succeeded['entities'][0]) == Transition.TRANSITION_ACTIVATE
+    assert (failed['start_state'], failed['goal_state']) == ('configuring', 'unconfigured')
+    assert failed['entities'][0].kind == 'Shutdown'
+    [emitted] = launched.of_kind('EmitEvent')
+    assert transition(emitted) == Transition.TRANSITION_CONFIGURE
+    assert launched.entities.index(emitted) == len(launched.entities) - 1
+
+
+def transition(emit_event: Recorder) -> int:
+    return emit_event.kwargs['event'].kwargs['transition_id']
+
+
+@pytest.mark.parametrize('file', FILES)
+def test_parameters_given_by_launch_exist(launch, file: str) -> None:
+    for name, node in launch(file).nodes.items():
+        known = {parameter.name for parameter in TABLES.get(name, ())} | {'use_sim_time'}
         given = {
-            key for part in node.kwargs['parameters'] if isinstance(part, dict) for key in part
+            key
+            for part in node.kwargs.get('parameters', [])
+            if isinstance(part, dict)
+            for key in part
         }
         assert given <= known
 

@@ -1,10 +1,12 @@
-"""Start the simulator, the goal node and the policy."""
+"""Start one robot: the simulator, the goal node and the policy; also recorder, pictures, RViz."""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
+from launch.conditions import IfCondition
 from launch.substitutions import (
     EnvironmentVariable,
     LaunchConfiguration,
+    NotEqualsSubstitution,
     PathJoinSubstitution,
 )
 from launch_ros.actions import LifecycleNode, Node
@@ -53,15 +55,44 @@ ARGUMENTS = (
         'use_sim_time',
         default_value='true',
         choices=['true', 'false'],
-        description="whether the goal and policy nodes follow the simulator's /clock",
+        description="whether the goal and policy nodes follow the simulator's clock",
+    ),
+    DeclareLaunchArgument(
+        'clock_topic',
+        default_value='/clock',
+        description='topic of the simulated time; relative for one in the namespace, so that '
+        'several robots have times of their own',
+    ),
+    DeclareLaunchArgument(
+        'policy',
+        default_value='true',
+        choices=['true', 'false'],
+        description='whether to start the policy node; false where something else does',
+    ),
+    DeclareLaunchArgument(
+        'record', default_value='', description='file (.mcap) to record to; empty: none'
+    ),
+    DeclareLaunchArgument(
+        'visualize',
+        default_value='false',
+        choices=['true', 'false'],
+        description='whether to publish odom, path and markers; RViz shows them',
+    ),
+    DeclareLaunchArgument(
+        'rviz',
+        default_value='false',
+        choices=['true', 'false'],
+        description='whether to start RViz, which has to be installed',
     ),
     DeclareLaunchArgument(
         'log_level',
         default_value='info',
         choices=['debug', 'info', 'warn', 'error', 'fatal'],
-        description='log level of the three nodes',
+        description='log level of the nodes',
     ),
 )
+
+SHOWN = ('map', 'odom', 'path', 'markers', 'goal_pose')
 
 
 def text(argument: str) -> ParameterValue:
@@ -75,11 +106,13 @@ def flag(argument: str) -> ParameterValue:
 
 
 def generate_launch_description() -> LaunchDescription:
-    """The three nodes; everything they can be told is in `ARGUMENTS` or the parameter file."""
+    """The nodes; everything they can be told is in `ARGUMENTS` or the parameter file."""
+    namespace = LaunchConfiguration('namespace')
     common = {
         'package': 'metagcttt',
-        'namespace': LaunchConfiguration('namespace'),
+        'namespace': namespace,
         'output': 'screen',
+        'remappings': [('/clock', LaunchConfiguration('clock_topic'))],
         'arguments': ['--ros-args', '--log-level', LaunchConfiguration('log_level')],
     }
     params_file = LaunchConfiguration('params_file')
@@ -111,7 +144,37 @@ def generate_launch_description() -> LaunchDescription:
                 executable='policy_node',
                 name='policy_node',
                 parameters=[params_file, dataset, policy, clock],
+                condition=IfCondition(LaunchConfiguration('policy')),
                 **common,
+            ),
+            Node(
+                executable='visualization_node',
+                name='visualization_node',
+                parameters=[environment, dataset, {'checkpoint': text('checkpoint')}],
+                condition=IfCondition(LaunchConfiguration('visualize')),
+                **common,
+            ),
+            Node(
+                executable='recorder_node',
+                name='recorder_node',
+                parameters=[{'output': text('record')}],
+                condition=IfCondition(NotEqualsSubstitution(LaunchConfiguration('record'), '')),
+                **common,
+            ),
+            Node(
+                package='rviz2',
+                executable='rviz2',
+                name='rviz2',
+                namespace=namespace,
+                arguments=[
+                    '-d',
+                    PathJoinSubstitution(
+                        [FindPackageShare('metagcttt'), 'rviz', 'metagcttt.rviz']
+                    ),
+                ],
+                # The file names the topics of a robot without a namespace.
+                remappings=[(f'/{topic}', topic) for topic in SHOWN],
+                condition=IfCondition(LaunchConfiguration('rviz')),
             ),
         ]
     )

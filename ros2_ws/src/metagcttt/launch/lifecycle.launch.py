@@ -1,0 +1,120 @@
+"""Start one robot whose policy node is configured and activated by launch.
+
+Where the policy cannot be configured, everything is shut down.
+"""
+
+from launch import LaunchDescription
+from launch.actions import (
+    DeclareLaunchArgument,
+    EmitEvent,
+    IncludeLaunchDescription,
+    RegisterEventHandler,
+    Shutdown,
+)
+from launch.events.matchers import matches_action
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import LifecycleNode
+from launch_ros.event_handlers import OnStateTransition
+from launch_ros.events.lifecycle import ChangeState
+from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.substitutions import FindPackageShare
+from lifecycle_msgs.msg import Transition
+
+SHARE = FindPackageShare('metagcttt')
+
+ARGUMENTS = (
+    DeclareLaunchArgument(
+        'namespace', default_value='', description='namespace of the whole robot'
+    ),
+    DeclareLaunchArgument(
+        'stepping',
+        default_value='realtime',
+        choices=['realtime', 'lockstep'],
+        description='whether the world goes on by itself or waits for every action; '
+        'chooses the parameter file',
+    ),
+    DeclareLaunchArgument(
+        'params_file',
+        default_value=[
+            PathJoinSubstitution([SHARE, 'config', LaunchConfiguration('stepping')]),
+            '.yaml',
+        ],
+        description='parameter file of the nodes, instead of the one for `stepping`',
+    ),
+    DeclareLaunchArgument(
+        'checkpoint', default_value='', description='folder of the policy; empty: committed one'
+    ),
+    DeclareLaunchArgument(
+        'dataset', default_value='', description='dataset file (.npz); empty: committed one'
+    ),
+)
+
+
+def text(argument: str) -> ParameterValue:
+    """A launch argument as a string parameter."""
+    return ParameterValue(LaunchConfiguration(argument), value_type=str)
+
+
+def generate_launch_description() -> LaunchDescription:
+    """The robot without its policy, the policy, and what drives its lifecycle."""
+    policy = LifecycleNode(
+        package='metagcttt',
+        executable='policy_node',
+        name='policy_node',
+        namespace=LaunchConfiguration('namespace'),
+        output='screen',
+        parameters=[
+            LaunchConfiguration('params_file'),
+            {
+                'autostart': False,
+                'use_sim_time': True,
+                'checkpoint': text('checkpoint'),
+                'dataset': text('dataset'),
+            },
+        ],
+    )
+
+    def request(transition_id: int) -> EmitEvent:
+        return EmitEvent(
+            event=ChangeState(
+                lifecycle_node_matcher=matches_action(policy), transition_id=transition_id
+            )
+        )
+
+    return LaunchDescription(
+        [
+            *ARGUMENTS,
+            IncludeLaunchDescription(
+                PythonLaunchDescriptionSource(
+                    PathJoinSubstitution([SHARE, 'launch', 'metagcttt.launch.py'])
+                ),
+                launch_arguments={
+                    'namespace': LaunchConfiguration('namespace'),
+                    'stepping': LaunchConfiguration('stepping'),
+                    'params_file': LaunchConfiguration('params_file'),
+                    'dataset': LaunchConfiguration('dataset'),
+                    'policy': 'false',
+                }.items(),
+            ),
+            # The handlers before the events that they answer.
+            RegisterEventHandler(
+                OnStateTransition(
+                    target_lifecycle_node=policy,
+                    start_state='configuring',
+                    goal_state='inactive',
+                    entities=[request(Transition.TRANSITION_ACTIVATE)],
+                )
+            ),
+            RegisterEventHandler(
+                OnStateTransition(
+                    target_lifecycle_node=policy,
+                    start_state='configuring',
+                    goal_state='unconfigured',
+                    entities=[Shutdown(reason='the policy cannot be configured, see its log')],
+                )
+            ),
+            policy,
+            request(Transition.TRANSITION_CONFIGURE),
+        ]
+    )
