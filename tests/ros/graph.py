@@ -68,6 +68,12 @@ class Graph:
             self._executor.spin_once(timeout_sec=0.05)
         return result
 
+    def wait_for(self, seconds: float) -> None:
+        """Spin for a while."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self._executor.spin_once(timeout_sec=0.02)
+
     def collect(self, message_type: type, topic: str, profile: QoSProfile = EVERY) -> list[Any]:
         """A list that grows by every message of a topic."""
         messages: list[Any] = []

@@ -31,6 +31,7 @@ class AdaptationWorker(Generic[Key, Result]):
         self._finished: deque[tuple[Key, Future[Result]]] = deque()
         self._cancel_current = threading.Event()
         self._current: Future[Result] | None = None
+        self.num_pending = 0  # jobs whose results were not collected yet
         # PyTorch keeps the number per thread.
         self._pool = ThreadPoolExecutor(
             max_workers=1,
@@ -46,6 +47,7 @@ class AdaptationWorker(Generic[Key, Result]):
             job: Called with a function that says whether to give up.
         """
         self.cancel()
+        self.num_pending += 1
         cancelled = self._cancel_current = threading.Event()
         self._current = self._pool.submit(job, cancelled.is_set)
 
@@ -66,6 +68,7 @@ class AdaptationWorker(Generic[Key, Result]):
         taken = []
         while self._finished:
             taken.append(self._finished.popleft())
+        self.num_pending -= len(taken)
         return taken
 
     def close(self) -> None:

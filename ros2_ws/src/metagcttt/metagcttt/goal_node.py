@@ -15,12 +15,17 @@ from sim_bridge import describe_environment
 
 from metagcttt.converters import feedback_message, to_array
 from metagcttt.deployment import dataset_path
+from metagcttt.diagnostics import Diagnostics
 from metagcttt.goal_announcer import GoalAnnouncer
+from metagcttt.goal_health import GoalMonitor
 from metagcttt.goals import Goal, goal_ending, GoalCatalog, Verdict
+from metagcttt.health import Health
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import GOAL_NODE
 from metagcttt.qos import COMMAND, EVENTS, LATCHED, state_profile
 from metagcttt.reach_goal_server import ReachGoalServer
+from metagcttt.state_order import StateOrder
+from metagcttt.vectors import vector_fault
 
 WATCH_PERIOD_S = 0.1
 
@@ -51,6 +56,8 @@ class GoalNode(Node):
         self._state: MazeState | None = None
         self._state_time = self.get_clock().now()
         self._source_seen_s = time.monotonic()
+        self._order = StateOrder()
+        self._monitor = GoalMonitor()
         self._policy = PolicyStatus()
         self._goal: Goal | None = None
         self._num_accepted = 0
@@ -69,6 +76,9 @@ class GoalNode(Node):
         )
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(WATCH_PERIOD_S, self._watch, clock=steady)
+        self._diagnostics = Diagnostics(
+            self, self._examine, self._settings['diagnostics_period_s']
+        )
         self.get_logger().info(f'goals in {self._spec.name}, completed from {dataset.source}')
 
     def end_service(self) -> None:
@@ -92,6 +102,7 @@ class GoalNode(Node):
         refusal = self._refusal(request)
         if refusal is not None:
             point = request.pose.pose.position
+            self._monitor.counts[refusal.error] += 1
             self._say.rejected(refusal, (point.x, point.y), self._state, request.request_id)
         return refusal is None
 
@@ -138,6 +149,7 @@ class GoalNode(Node):
         if message.kind != EpisodeEvent.STARTED:
             return
         self._void_unless(message.episode_id)
+        self._order = StateOrder()
         self._expect_episode(message.episode_id)
         if not message.goal:
             return
@@ -192,6 +204,14 @@ class GoalNode(Node):
     # --- goals go on and end -----------------------------------------------------------------
 
     def _on_state(self, message: MazeState) -> None:
+        xy = (message.position.x, message.position.y)
+        fault = vector_fault('the state', to_array(message.observation), self._spec.obs_dim)
+        fault = fault or vector_fault("the state's position", np.array(xy), 2)
+        if self._settings['stepping'] == 'realtime':
+            fault = fault or self._order.refusal(message.episode_id, message.step)
+        self._monitor.saw_state(fault)
+        if fault:
+            return
         if self._goal is not None and message.episode_id < self._goal.episode_id:
             return  # the goal's own episode is on the way
         self._state = message
@@ -202,7 +222,7 @@ class GoalNode(Node):
             return
         ending = goal_ending(
             self._goal,
-            xy=(message.position.x, message.position.y),
+            xy=xy,
             step=message.step,
             ended=message.terminated or message.truncated,
             success=message.success,
@@ -218,6 +238,7 @@ class GoalNode(Node):
 
     def _on_policy(self, message: PolicyStatus) -> None:
         self._policy = message
+        self._monitor.saw_policy()
         self._report_progress()
 
     def _report_progress(self) -> None:
@@ -256,5 +277,9 @@ class GoalNode(Node):
         if self._state is not None and self._state.episode_id == goal.episode_id:
             step = max(step, self._state.step)
         self._say.ended(goal, verdict, step)
+        self._monitor.counts[verdict.error] += 1
         seconds = (self.get_clock().now().nanoseconds - goal.accepted_ns) / 1e9
         self._reach_goal.finish(verdict, step - goal.first_step, seconds)
+
+    def _examine(self) -> Health:
+        return self._monitor.examine(self._goal, has_source=bool(self.count_publishers('state')))

@@ -13,6 +13,13 @@ STEPPING = Parameter(
     choices=('realtime', 'lockstep'),
 )
 FRAME_ID = Parameter('frame_id', 'map', 'frame of the maze, of all positions and of all goals')
+DIAGNOSTICS_PERIOD_S = Parameter(
+    'diagnostics_period_s',
+    1.0,
+    'time between two messages on /diagnostics, seconds',
+    minimum=0.01,
+    maximum=3600,
+)
 DATASET = Parameter('dataset', '', 'dataset file (.npz); empty: the committed one')
 
 GOAL_NODE = (
@@ -20,6 +27,7 @@ GOAL_NODE = (
     DATASET,
     STEPPING,
     FRAME_ID,
+    DIAGNOSTICS_PERIOD_S,
     Parameter(
         'goal_tolerance_m',
         0.0,
@@ -75,12 +83,14 @@ SIM_BRIDGE_NODE = (
         maximum=3600,
         changes='now',
     ),
+    DIAGNOSTICS_PERIOD_S,
     Parameter('publish_clock', True, 'publish the simulated time on /clock'),
     Parameter('seed', 0, 'seed of the first episode', minimum=0, maximum=2**32 - 1),
     Parameter('start_paused', False, 'stand still until the service pause says otherwise'),
 )
 
 POLICY_NODE = (
+    DIAGNOSTICS_PERIOD_S,
     Parameter('autostart', True, 'configure and activate at the start'),
     Parameter(
         'checkpoint', '', 'folder of the policy; empty: the committed one', changes='configure'
@@ -165,7 +175,7 @@ POLICY_NODE = (
     Parameter(
         'rate_hz',
         20.0,
-        'realtime: actions per second of the node clock',
+        'realtime: actions per second of the node clock, besides one at once for every state',
         minimum=0.1,
         maximum=1000,
         changes='now',
@@ -179,9 +189,34 @@ POLICY_NODE = (
         changes='now',
     ),
     Parameter(
-        'threads',
+        'warn_latency_ms',
+        20.0,
+        'diagnostics warn when 99 % of states are not answered within this time, milliseconds',
+        minimum=0,
+        maximum=10**6,
+        changes='now',
+    ),
+    Parameter(
+        'warn_missed_deadlines',
         0,
-        "threads that PyTorch uses; 0: PyTorch's own choice",
+        'diagnostics warn when more control periods than this passed without an action in a '
+        'minute; not counted on simulated time',
+        minimum=0,
+        maximum=10**6,
+        changes='now',
+    ),
+    Parameter(
+        'warn_adapt_ms',
+        10000.0,
+        'diagnostics warn when an adaptation takes longer, milliseconds',
+        minimum=0,
+        maximum=10**9,
+        changes='now',
+    ),
+    Parameter(
+        'threads',
+        1,
+        "threads that PyTorch uses in the adaptation; 0: PyTorch's own choice",
         minimum=0,
         maximum=256,
         changes='configure',

@@ -75,11 +75,15 @@ class Query:
 
 @dataclass(frozen=True)
 class Command:
-    """An action and where it comes from; `query_id` 0 and zeros when there is nothing to do."""
+    """An action and where it comes from; `query_id` 0 and zeros when there is nothing to do.
+
+    `fault` says why it is zero although a policy acted.
+    """
 
     values: NDArray[np.floating]
     query_id: int = 0
     adapted: bool = False
+    fault: str = ''
 
 
 def choose(state: State, query: Query | None, act_dim: int) -> Command:
@@ -95,4 +99,7 @@ def choose(state: State, query: Query | None, act_dim: int) -> Command:
     if state.fault:
         return Command(np.zeros(act_dim), query.query_id)
     values = query.expert.act(state.observation, query.goal)
+    if not np.isfinite(values).all():
+        fault = f'the policy gave {values.tolist()}'
+        return Command(np.zeros(act_dim), query.query_id, fault=fault)
     return Command(values, query.query_id, query.adapted)

@@ -5,12 +5,16 @@ from typing import Any
 from metagcttt_core import FilterConfig
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from std_srvs.srv import SetBool
 import torch
 
 from metagcttt.deployment import load_deployment
+from metagcttt.diagnostics import Diagnostics
+from metagcttt.health import Health, Level
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import POLICY_NODE
 from metagcttt.policy_session import PolicySession
+from metagcttt.warm_up import warm_up
 
 
 class PolicyNode(LifecycleNode):
@@ -24,10 +28,16 @@ class PolicyNode(LifecycleNode):
         """
         super().__init__('policy_node', **kwargs)
         self._session: PolicySession | None = None
+        self._enabled = True
         self._settings = ParameterSet(
             self, POLICY_NODE, is_configured=lambda: self._session is not None
         )
         self.add_post_set_parameters_callback(self._on_parameters_set)
+        self.create_service(SetBool, 'enable', self._on_enable)
+        self._failure = ''  # of the newest configuration
+        self._diagnostics = Diagnostics(
+            self, self._examine, self._settings['diagnostics_period_s']
+        )
         if self._settings['autostart']:
             if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
                 self.trigger_activate()
@@ -50,13 +60,16 @@ class PolicyNode(LifecycleNode):
             deployment = load_deployment(
                 self._settings['checkpoint'], self._settings['dataset'], config
             )
+            warm_up(deployment)
         except (OSError, ValueError) as error:
             # rclpy would swallow it without a word.
-            self.get_logger().error(f'cannot configure: {error}')
+            self._failure = f'cannot configure: {error}'
+            self.get_logger().error(self._failure)
             return TransitionCallbackReturn.FAILURE
         if self._settings['threads']:
             torch.set_num_threads(self._settings['threads'])
-        self._session = PolicySession(self, self._settings, deployment)
+        self._failure = ''
+        self._session = PolicySession(self, self._settings, deployment, enabled=self._enabled)
         agent, dataset = deployment.agent, deployment.dataset
         self.get_logger().info(
             f'{agent.name} policy for observations of {agent.obs_dim} and actions of '
@@ -92,6 +105,20 @@ class PolicyNode(LifecycleNode):
         if self._session is not None:
             self._session.close()
             self._session = None
+
+    def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self._enabled = request.data
+        if self._session is not None:
+            self._session.enable(self._enabled)
+        response.success = True
+        response.message = 'enabled' if self._enabled else 'disabled: every action is zero'
+        return response
+
+    def _examine(self) -> Health:
+        if self._session is not None:
+            return self._session.examine()
+        level = Level.ERROR if self._failure else Level.OK
+        return Health(level, self._failure or 'not configured')
 
     def _on_parameters_set(self, parameters: list[Parameter]) -> None:
         if self._session is not None and any(p.name == 'rate_hz' for p in parameters):

@@ -1,10 +1,12 @@
 """A configured policy on the graph: takes states and goals, adapts and acts."""
 
+from dataclasses import replace
 from functools import partial
+import time
 
 from metagcttt_core import TTTConfig
 from metagcttt_core.adaptation import AdaptationCancelled
-from metagcttt_interfaces.msg import GoalQuery, MazeState
+from metagcttt_interfaces.msg import GoalQuery, MazeState, PolicyStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode
 from rclpy.timer import Timer
@@ -12,14 +14,18 @@ from rclpy.timer import Timer
 from metagcttt.adaptation_worker import AdaptationWorker
 from metagcttt.converters import to_array
 from metagcttt.deployment import answer_query, Deployment, Outcome
+from metagcttt.health import Health
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.pilot import choose, Query, State
 from metagcttt.policy_announcer import PolicyAnnouncer
+from metagcttt.policy_health import Limits, PolicyMonitor
 from metagcttt.qos import LATCHED, state_profile
+from metagcttt.state_order import StateOrder
 from metagcttt.vectors import vector_fault
 
 WARNING_PERIOD_S = 5.0
 WATCH_PERIOD_S = 0.1
+RIVAL_S = 1.0  # another policy that was heard this lately is there
 
 
 class PolicySession:
@@ -31,7 +37,12 @@ class PolicySession:
     """
 
     def __init__(
-        self, node: LifecycleNode, settings: ParameterSet, deployment: Deployment
+        self,
+        node: LifecycleNode,
+        settings: ParameterSet,
+        deployment: Deployment,
+        *,
+        enabled: bool = True,
     ) -> None:
         """Connect; nothing is published before `start`.
 
@@ -39,7 +50,13 @@ class PolicySession:
             node: The node to connect through.
             settings: Its parameters.
             deployment: Policy and dataset.
+            enabled: Whether actions may be other than zero.
         """
+        self._enabled = enabled
+        self._order = StateOrder()
+        self._monitor = PolicyMonitor()
+        self._rival_seen_s = float('-inf')
+        self._received_ns = 0  # when the newest state was; 0 once it is answered
         self._node = node
         self._settings = settings
         self._deployment = deployment
@@ -59,8 +76,14 @@ class PolicySession:
         self._watch = node.create_timer(WATCH_PERIOD_S, self._on_watch, clock=steady)
         profile = state_profile(settings['stepping'])
         self._inputs = (
-            node.create_subscription(MazeState, 'state', self._on_state, profile),
+            node.create_subscription(
+                MazeState,
+                'state',
+                self._on_state,  # type: ignore[arg-type] # rclpy gives it the info as well
+                profile,
+            ),
             node.create_subscription(GoalQuery, 'goal', self._on_goal, LATCHED),
+            node.create_subscription(PolicyStatus, 'policy_status', self._on_status, LATCHED),
         )
 
     def start(self) -> None:
@@ -78,6 +101,12 @@ class PolicySession:
         if self._timer is not None:
             self._stop_timer()
             self._publish_action(None)
+
+    def enable(self, enabled: bool) -> None:
+        """Let actions be other than zero, or not; takes effect at once."""
+        self._enabled = enabled
+        if self._timer is not None:
+            self._on_tick()
 
     def close(self) -> None:
         """Disconnect and end the adaptation thread."""
@@ -101,24 +130,44 @@ class PolicySession:
         if self._timer is not None:
             self._node.destroy_timer(self._timer)
             self._timer = None
+            self._monitor.deadlines.pause()
 
     # --- what arrives ------------------------------------------------------------------------
 
-    def _on_state(self, message: MazeState) -> None:
+    def _on_state(self, message: MazeState, info: dict[str, int]) -> None:
+        now_s = time.monotonic()
+        self._monitor.states.add(now_s)
+        out_of_order = ''
+        if not self._lockstep:  # there an answer names the one state that it is for
+            out_of_order = self._order.refusal(message.episode_id, message.step)
         observation = to_array(message.observation)
-        self._state = State(
-            episode_id=message.episode_id,
-            step=message.step,
-            observation=observation,
-            ended=message.terminated or message.truncated,
-            fault=vector_fault('the state', observation, self._deployment.agent.obs_dim),
-        )
+        fault = vector_fault('the state', observation, self._deployment.agent.obs_dim)
+        if out_of_order:
+            self._monitor.faults.note('states_out_of_order', out_of_order, now_s)
+        elif fault:
+            self._monitor.faults.note('malformed_states', fault, now_s)
+        if out_of_order and self._state is not None:
+            # The simulator heeds actions for the episode it is in.
+            self._state = replace(self._state, fault=out_of_order)
+        else:
+            self._state = State(
+                episode_id=message.episode_id,
+                step=message.step,
+                observation=observation,
+                ended=message.terminated or message.truncated,
+                fault=fault,
+            )
         self._state_time = self._node.get_clock().now()
+        self._received_ns = info['received_timestamp']
         self._answered = False
         query = self._query
         if query is not None and query.adapting and not query.serves(self._state):
             self._worker.cancel()
         self._proceed()
+
+    def _on_status(self, message: PolicyStatus) -> None:
+        if message.instance != self._say.instance:
+            self._rival_seen_s = time.monotonic()
 
     def _on_goal(self, message: GoalQuery) -> None:
         self._worker.cancel()
@@ -157,15 +206,17 @@ class PolicySession:
     # --- adapting ----------------------------------------------------------------------------
 
     def _proceed(self) -> None:
-        """Do what the newest state and goal ask for: adapt and, in lockstep, act."""
+        """Do what the newest state and goal ask for: adapt and act."""
         query, state = self._query, self._state
         if not self._acting or query is None or state is None:
             return
         if query.needs_adaptation(state):
             self._adapt(query, state)
-        if self._lockstep and not self._answered and query.has_action(state):
+        if not self._answered and query.has_action(state):
             self._answered = True
             self._publish_action(query)
+            if self._timer is not None:
+                self._timer.reset()
         self._on_watch()
 
     def _adapt(self, query: Query, state: State) -> None:
@@ -196,12 +247,14 @@ class PolicySession:
                 except AdaptationCancelled:
                     pass
                 except (ValueError, RuntimeError) as error:
-                    reason = f'failed: {error}'
+                    reason = self._monitor.remark = f'failed: {error}'
                     self._node.get_logger().error(f'goal {query.query_id}: {reason}')
             self._say.report(query.query_id, query.episode_id, reason=reason)
         self._proceed()
 
     def _conclude(self, query: Query, outcome: Outcome) -> None:
+        self._monitor.adapt_ms.add(1000 * outcome.adaptation.seconds)
+        self._monitor.remark = outcome.adaptation.reason
         query.expert = outcome.adaptation.agent
         query.adapted = outcome.adaptation.accepted
         query.steps_done = len(outcome.adaptation.train_losses)
@@ -210,26 +263,72 @@ class PolicySession:
     # --- what is published -------------------------------------------------------------------
 
     def _on_tick(self) -> None:
+        self._publish_action(self._query)
+
+    def _zero_reason(self) -> str:
+        """Why the robot may not move now; empty when it may."""
+        now_s = time.monotonic()
+        if not self._enabled:
+            return 'disabled by the service enable'
+        if now_s - self._rival_seen_s < RIVAL_S:
+            return 'another policy node acts in this graph'
         if self._state is None:
-            return
+            return ''
         age_s = (self._node.get_clock().now() - self._state_time).nanoseconds / 1e9
-        if age_s > self._settings['state_timeout_s']:
-            self._warn(f'no state for {age_s:.1f} s')
-            self._publish_action(None)
-        else:
-            self._publish_action(self._query)
+        if not self._lockstep and age_s > self._settings['state_timeout_s']:
+            return f'no state for {age_s:.1f} s'
+        return self._state.fault
 
     def _publish_action(self, query: Query | None) -> None:
         """Publish the action for the newest state; zero without a query."""
         state = self._state
         if state is None:
             return
-        if state.fault:
-            self._warn(state.fault)
-        self._say.action(state, choose(state, query, self._deployment.agent.act_dim))
+        act_dim = self._deployment.agent.act_dim
+        zero_reason = self._zero_reason()
+        if zero_reason:
+            command = choose(replace(state, fault=zero_reason), query, act_dim)
+        else:
+            command = choose(state, query, act_dim)
+            if command.fault:
+                zero_reason = command.fault
+                self._monitor.faults.note('unusable_actions', zero_reason, time.monotonic())
+        if zero_reason:
+            self._warn(zero_reason)
+        self._say.action(state, command)
+        self._measure()
+
+    def _measure(self) -> None:
+        now_s = time.monotonic()
+        self._monitor.actions.add(now_s)
+        if self._received_ns:
+            self._monitor.latency_ms.add((time.time_ns() - self._received_ns) / 1e6)
+            self._received_ns = 0
+        # Simulated time goes by in steps that may be longer than the period.
+        if self._timer is not None and not self._node.get_parameter('use_sim_time').value:
+            self._monitor.deadlines.met(now_s, 1.0 / self._settings['rate_hz'])
+
+    def _no_source_reason(self) -> str:
+        # Simulated time stands still without a simulator, and no state gets too old.
+        return '' if self._node.count_publishers('state') else 'nobody publishes states'
 
     def _on_watch(self) -> None:
         self._say.status(self._query, self._state)
+
+    def examine(self) -> Health:
+        """How the policy is."""
+        return self._monitor.examine(
+            acting=self._acting,
+            zero_reason=self._zero_reason() or self._no_source_reason(),
+            query=self._query,
+            num_publishers=self._node.count_publishers('action'),
+            worker=self._worker,
+            limits=Limits(
+                latency_ms=self._settings['warn_latency_ms'],
+                missed_deadlines=self._settings['warn_missed_deadlines'],
+                adapt_ms=self._settings['warn_adapt_ms'],
+            ),
+        )
 
     def _warn(self, fault: str) -> None:
         self._node.get_logger().warning(

@@ -25,10 +25,13 @@ from metagcttt.converters import (
     to_point,
     to_time,
 )
+from metagcttt.diagnostics import Diagnostics
+from metagcttt.health import Health
 from metagcttt.pacing import Pacer
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import SIM_BRIDGE_NODE
 from metagcttt.qos import COMMAND, EVENTS, LATCHED, SENSOR, state_profile
+from metagcttt.sim_health import SimMonitor
 from metagcttt.vectors import vector_fault
 
 
@@ -56,6 +59,7 @@ class SimBridgeNode(Node):
         """
         super().__init__('sim_bridge_node', **kwargs)
         self._settings = ParameterSet(self, SIM_BRIDGE_NODE, is_configured=lambda: True)
+        self._monitor = SimMonitor()
         self._simulator = make_simulator(self._settings['environment'])
         spec = self._simulator.spec
         self._lockstep = self._settings['stepping'] == 'lockstep'
@@ -83,6 +87,9 @@ class SimBridgeNode(Node):
         self.create_service(Trigger, 'step', self._on_step)
         self.add_post_set_parameters_callback(self._on_parameters_set)
 
+        self._diagnostics = Diagnostics(
+            self, self._examine, self._settings['diagnostics_period_s']
+        )
         self._map.publish(occupancy_grid(self._simulator.maze, self._header()))
         self.get_logger().info(
             f'{spec.name}, {self._settings["stepping"]}: observations of {spec.obs_dim}, '
@@ -152,6 +159,7 @@ class SimBridgeNode(Node):
             return
         values = to_array(message.values)
         fault = vector_fault('the action', values, self._simulator.spec.act_dim)
+        self._monitor.saw_action(fault)
         if fault:
             self.get_logger().warning(f'ignored: {fault}', throttle_duration_sec=5.0)
         elif self._lockstep and self._paused:
@@ -251,7 +259,15 @@ class SimBridgeNode(Node):
     def _header(self) -> Header:
         return Header(stamp=to_time(self._time_ns), frame_id=self._settings['frame_id'])
 
+    def _examine(self) -> Health:
+        age_s = (self._time_ns - self._action_time_ns) / 1e9
+        return self._monitor.examine(
+            num_publishers=self.count_publishers('action'),
+            action_is_old=not self._lockstep and age_s > self._settings['action_timeout_s'],
+        )
+
     def _publish_state(self) -> None:
+        self._monitor.states.add(time.monotonic())
         if self._clock_messages is not None:
             self._clock_messages.publish(ClockMessage(clock=to_time(self._time_ns)))
         self._states.publish(

@@ -1,0 +1,119 @@
+"""Figures and verdicts behind the diagnostics. No ROS in here."""
+
+from collections import deque
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import numpy as np
+
+WINDOW_S = 5.0
+MINUTE_S = 60.0
+
+
+class Level(IntEnum):
+    """As in diagnostic_msgs/DiagnosticStatus."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+
+
+@dataclass(frozen=True)
+class Health:
+    """How a node is: a level, why, and figures by name with their units."""
+
+    level: Level
+    message: str
+    values: dict[str, str] = field(default_factory=dict)
+
+
+class Samples:
+    """The last thousand values of something."""
+
+    def __init__(self, size: int = 1000) -> None:
+        """Keep the last `size` values."""
+        self._values: deque[float] = deque(maxlen=size)
+
+    def add(self, value: float) -> None:
+        """One more."""
+        self._values.append(value)
+
+    def percentile(self, percent: float) -> float:
+        """The value that `percent` of them do not exceed; 0 when there are none."""
+        return float(np.percentile(list(self._values), percent)) if self._values else 0.0
+
+    def last(self) -> float:
+        """The newest; 0 when there are none."""
+        return self._values[-1] if self._values else 0.0
+
+
+class Rate:
+    """How often something happens, over the last five seconds."""
+
+    def __init__(self) -> None:
+        """It has not happened yet."""
+        self._times_s: deque[float] = deque()
+        self.total = 0
+
+    def add(self, now_s: float) -> None:
+        """It happened at `now_s`, seconds of a clock that only goes forward."""
+        self._times_s.append(now_s)
+        self.total += 1
+        self._forget(now_s)
+
+    def per_second(self, now_s: float) -> float:
+        """Its rate, hertz."""
+        self._forget(now_s)
+        return len(self._times_s) / WINDOW_S
+
+    def _forget(self, now_s: float) -> None:
+        while self._times_s and now_s - self._times_s[0] > WINDOW_S:
+            self._times_s.popleft()
+
+
+class Deadlines:
+    """Counts control periods that went by without an action."""
+
+    def __init__(self) -> None:
+        """Nothing is missed before the first action."""
+        self._last_s: float | None = None
+        self._missed: deque[tuple[float, int]] = deque()
+        self.total = 0
+
+    def met(self, now_s: float, period_s: float) -> None:
+        """An action went out; whole periods since the one before it, rounded, were missed."""
+        if self._last_s is not None:
+            missed = int((now_s - self._last_s) / period_s + 0.5) - 1
+            if missed > 0:
+                self._missed.append((now_s, missed))
+                self.total += missed
+        self._last_s = now_s
+
+    def pause(self) -> None:
+        """No action is due before the next one."""
+        self._last_s = None
+
+    def in_last_minute(self, now_s: float) -> int:
+        """Number of misses in the last minute."""
+        while self._missed and now_s - self._missed[0][0] > MINUTE_S:
+            self._missed.popleft()
+        return sum(missed for _, missed in self._missed)
+
+
+class Faults:
+    """What went wrong lately, so that no fault is too short to be reported."""
+
+    def __init__(self) -> None:
+        """Nothing has."""
+        self.counts: dict[str, int] = {}
+        self._newest = ('', float('-inf'))
+
+    def note(self, kind: str, reason: str, now_s: float) -> None:
+        """A fault of a kind, such as `malformed_states`, with the reason in words."""
+        self.counts[kind] = self.counts.get(kind, 0) + 1
+        self._newest = (reason, now_s)
+
+    def recent(self, now_s: float, memory_s: float = 1.0) -> str:
+        """The newest fault when it is not older than `memory_s`; else empty."""
+        reason, time_s = self._newest
+        return reason if now_s - time_s <= memory_s else ''

@@ -1,0 +1,48 @@
+"""How a simulator's bridge is. No ROS in here."""
+
+import time
+
+from metagcttt.health import Faults, Health, Level, Rate
+
+
+class SimMonitor:
+    """Gathers figures while a world is stepped, and judges them."""
+
+    def __init__(self) -> None:
+        """Nothing has happened yet."""
+        self.states = Rate()
+        self.actions = Rate()
+        self.faults = Faults()
+
+    def saw_action(self, fault: str) -> None:
+        """An action for this episode arrived; `fault` says why it is not used."""
+        now_s = time.monotonic()
+        self.actions.add(now_s)
+        if fault:
+            self.faults.note('malformed_actions', fault, now_s)
+
+    def examine(self, *, num_publishers: int, action_is_old: bool) -> Health:
+        """The health now.
+
+        Args:
+            num_publishers: Of actions.
+            action_is_old: In realtime: the newest action is too old, so the world goes on with
+                zero.
+        """
+        now_s = time.monotonic()
+        values = {
+            'state_rate_hz': f'{self.states.per_second(now_s):.1f}',
+            'action_rate_hz': f'{self.actions.per_second(now_s):.1f}',
+            'action_publishers': str(num_publishers),
+            **{kind: str(count) for kind, count in sorted(self.faults.counts.items())},
+        }
+        level, message = Level.OK, 'stepping'
+        if recent := self.faults.recent(now_s):
+            level, message = Level.ERROR, f'an action was ignored: {recent}'
+        elif num_publishers > 1:
+            level, message = Level.WARN, f'{num_publishers} nodes publish actions'
+        elif num_publishers == 0:
+            level, message = Level.WARN, 'nobody publishes actions'
+        elif action_is_old:
+            level, message = Level.WARN, 'the action is zero: none has come lately'
+        return Health(level, message, values)
