@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 import os
 from pathlib import Path
+import shutil
 import tempfile
 from tokenize import TokenError
 from typing import IO
@@ -101,4 +102,7 @@ def _unpack(path: Path, archive: zipfile.ZipFile, members: Mapping[str, zipfile.
             except (zipfile.BadZipFile, zlib.error, EOFError) as error:
                 raise DatasetError(f'{path}: {name} is truncated or damaged ({error})') from error
             os.replace(extracted, target)
+    for outdated in folder.parent.iterdir():
+        if outdated != folder:
+            shutil.rmtree(outdated)
     return folder

@@ -46,6 +46,8 @@ class SpatialIndex:
             self._restore(saved)
         else:
             self._build()
+        # Columns of cells that hold any row: a wide ball over a fine grid passes many that do not.
+        self._occupied = np.unique(self._keys // self._stride)
 
     def _build(self) -> None:
         columns = [self._observations[:, dim] for dim in self._dims[:2]]
@@ -147,7 +149,8 @@ class SpatialIndex:
             return []
         first = [int(self._cell(low[axis], axis)) for axis in range(len(low))]
         last = [int(self._cell(high[axis], axis)) for axis in range(len(high))]
-        columns = np.arange(first[0], last[0] + 1) * self._stride
+        in_range = slice(*np.searchsorted(self._occupied, [first[0], last[0] + 1]))
+        columns = self._occupied[in_range] * self._stride
         in_column = (first[1], last[1]) if len(first) == 2 else (0, 0)
         begin = self._starts[np.searchsorted(self._keys, columns + in_column[0], side='left')]
         end = self._starts[np.searchsorted(self._keys, columns + in_column[1], side='right')]

@@ -80,7 +80,7 @@ class ValueCache:
     def _evaluate(
         self, value_fn: ValueFunction, goal: np.ndarray, known: np.ndarray, rows: np.ndarray
     ) -> None:
-        result = np.asarray(value_fn(self._dataset.observations[rows], goal))
+        result = np.asarray(value_fn(self._dataset.observations[rows], goal), np.float32)
         if result.shape != rows.shape:
             raise ValueError(f'value_fn must return shape {rows.shape}, got {result.shape}')
         if not np.isfinite(result).all():

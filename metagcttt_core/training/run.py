@@ -74,6 +74,12 @@ class TrainingRun:
                     f'{self._folder}: cannot resume, {name} was {saved!r} and is now {asked!r}'
                 )
         saved_agent = load_checkpoint(self._folder)
+        for name in ('obs_dim', 'act_dim', 'settings'):
+            saved, asked = getattr(saved_agent, name), getattr(agent, name)
+            if saved != asked:
+                raise CheckpointError(
+                    f'{self._folder}: cannot resume, {name} of the agent was {saved}, is {asked}'
+                )
         agent.load_state_dict(saved_agent.state_dict())
         if optimizer is not None:
             optimizer.load_state_dict({**optimizer.state_dict(), 'state': state.optimizer})

@@ -120,6 +120,7 @@ def test_memory_map_is_renewed_when_the_file_changes(tmp_path):
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
     assert_same(TrajectoryDataset.load(path, memory_map=True), second)
     assert np.array_equal(mapped.observations, first.observations)
+    assert len(list((tmp_path / 'data.unpacked').iterdir())) == 1  # the old rows take no room
 
 
 def test_memory_map_is_unpacked_once(tmp_path):

@@ -90,3 +90,10 @@ def test_kept_arrays_restore_the_same_index():
         ours, theirs = built.ball(point, 1.5), restored.ball(point, 1.5)
         assert ours.rows.tolist() == theirs.rows.tolist()
         assert ours.distances.tolist() == theirs.distances.tolist()
+
+
+def test_a_wide_ball_over_a_fine_grid_visits_only_columns_that_hold_rows():
+    corners = np.array([[0, 0], [1e4, 0], [0, 1e4], [1e4, 1e4]], np.float32)
+    index = SpatialIndex(corners, (0, 1), None, 1e-5)  # a thousand million columns
+    assert index.nearest(np.array([5e3 + 1, 5e3 + 1])) == 3
+    assert len(index.ball(np.array([5e3, 5e3]), 9e3).rows) == 4

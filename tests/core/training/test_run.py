@@ -120,3 +120,10 @@ def test_stop_after_the_last_step_is_no_interruption(tmp_path):
     run = TrainingRun('pretrain', SETTINGS, tmp_path, should_stop=lambda: True)
     run.step_done(agent, optimizer, 10, 10)
     assert load_training_state(tmp_path).step == 10
+
+
+def test_resume_refuses_an_agent_of_another_shape_by_name(tmp_path):
+    small, large = tiny_agent(hidden=(6,)), tiny_agent(hidden=(7,))
+    TrainingRun('pretrain', {}, tmp_path).step_done(small, None, 1, 1)
+    with pytest.raises(CheckpointError, match='cannot resume, settings of the agent was'):
+        TrainingRun('pretrain', {}, tmp_path, resume=True).restore(large, None)
