@@ -216,6 +216,65 @@ def test_failing_adaptation_is_reported_and_the_base_policy_acts(
     assert not rig.action().adapted
 
 
+def test_expert_comes_from_the_cache_for_the_same_cells(make_rig) -> None:
+    rig = make_rig(cache_size=5, cache_cell_m=2.0, adaptation='hold')
+    for query_id, xy in ((1, (0.5, 0.5)), (2, (0.7, 0.3)), (3, (-0.5, 0.5))):
+        step = 2 * query_id
+        rig.state(xy=xy, step=step)
+        rig.graph.wait(
+            lambda step=step: rig.session._state and rig.session._state.step == step, 'the state'
+        )
+        rig.goal(query_id)
+        rig.report(query_id)
+        rig.state(xy=xy, step=step + 1)
+        rig.action(lambda action, query_id=query_id: action.query_id == query_id)
+    assert [rig.report(n).cached for n in (1, 2, 3)] == [False, True, False]
+    made, found = rig.report(1), rig.report(2)
+    assert found.accepted
+    assert (found.adapt_ms, list(found.train_losses)) == (0.0, list(made.train_losses))
+    second = rig.action(lambda action: action.query_id == 2)
+    assert second.adapted
+    assert rig.set(cache_size=1).startswith('cache_size is read at configuration')
+
+
+def test_without_a_cache_every_query_is_adapted_to(make_rig) -> None:
+    rig = make_rig()
+    rig.state()
+    for query_id in (1, 2):
+        rig.goal(query_id)
+        assert not rig.report(query_id).cached
+        assert rig.report(query_id).adapt_ms > 0
+
+
+@pytest.mark.parametrize(('early_stopping', 'adapted'), [(True, False), (False, True)])
+def test_early_stopping_keeps_the_base_policy_when_the_held_out_loss_only_gets_worse(
+    make_rig, early_stopping: bool, adapted: bool
+) -> None:
+    # At this rate one step throws the weights far off.
+    rig = make_rig(early_stopping=early_stopping, test_fraction=0.5, adapt_lr=1.0, adapt_steps=2)
+    rig.set(adaptation='hold')
+    rig.state()
+    rig.goal()
+    report = rig.report()
+    assert report.accepted == adapted
+    action = rig.action()
+    base = rig.base.act(ON_THE_WAY, TASK_1_GOAL)
+    assert np.array_equal(action.values, base) != adapted
+    if early_stopping:
+        losses = list(report.test_losses)
+        assert (report.best_step, len(losses), min(losses)) == (0, 3, losses[0])
+        assert report.reason == 'the held-out loss never fell below its start'
+
+
+def test_early_stopping_takes_the_step_that_does_best_on_the_held_out_part(make_rig) -> None:
+    rig = make_rig(early_stopping=True, adapt_steps=8, adapt_lr=0.003, adaptation='hold')
+    rig.state()
+    rig.goal()
+    report = rig.report()
+    assert report.accepted
+    assert report.best_step == int(np.argmin(report.test_losses)) > 0
+
+
 # --- acting -----------------------------------------------------------------------------------
 
 

@@ -91,6 +91,7 @@ def report_message(
     support: SupportSet | None,
     adaptation: Adaptation | None,
     reason: str = '',
+    cached: bool = False,
 ) -> AdaptationReport:
     """What became of one query.
 
@@ -101,6 +102,7 @@ def report_message(
         support: What the filter found; None when it did not run.
         adaptation: What the inner loop made of it; None when it did not end.
         reason: Why there is no adaptation; otherwise the adaptation's own reason is taken.
+        cached: The adaptation was made for an earlier query; no time was spent on this one.
     """
     message = AdaptationReport(
         header=Header(stamp=stamp), query_id=query_id, episode_id=episode_id, reason=reason
@@ -109,11 +111,12 @@ def report_message(
         message.relevant_trajectories = int(support.num_relevant)
         message.kept_trajectories = int(support.num_kept)
         message.transitions = int(support.num_transitions)
-        message.filter_ms = float(support.milliseconds)
+        message.filter_ms = 0.0 if cached else float(support.milliseconds)
         message.segment_starts = [int(start) for start, _ in support.segments]
         message.segment_stops = [int(stop) for _, stop in support.segments]
     if adaptation is not None:
-        message.adapt_ms = 1000.0 * adaptation.seconds
+        message.adapt_ms = 0.0 if cached else 1000.0 * adaptation.seconds
+        message.cached = cached
         message.steps = len(adaptation.train_losses)
         message.train_losses = to_floats(adaptation.train_losses)
         message.test_losses = to_floats(adaptation.test_losses)

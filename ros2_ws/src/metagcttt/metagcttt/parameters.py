@@ -140,6 +140,14 @@ POLICY_NODE = (
         'hold out part of the support set and keep the step that does best on it',
         changes='now',
     ),
+    Parameter(
+        'test_fraction',
+        0.2,
+        'share of the support set that early stopping holds out',
+        minimum=0.01,
+        maximum=0.99,
+        changes='now',
+    ),
     Parameter('actor_only', False, 'adapt the actor alone, not the critic', changes='now'),
     Parameter(
         'horizon',
@@ -148,6 +156,22 @@ POLICY_NODE = (
         minimum=0,
         maximum=10**6,
         changes='now',
+    ),
+    Parameter(
+        'cache_size',
+        0,
+        'experts to keep for queries from the same cell to the same cell; 0: none',
+        minimum=0,
+        maximum=10000,
+        changes='configure',
+    ),
+    Parameter(
+        'cache_cell_m',
+        1.0,
+        'edge of the cells that tell whether an expert fits again, metres',
+        minimum=0.001,
+        maximum=1000,
+        changes='configure',
     ),
     Parameter(
         'filter_variant',

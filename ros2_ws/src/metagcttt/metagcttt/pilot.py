@@ -1,5 +1,6 @@
 """What the policy does with the newest state and the newest goal. No ROS in here."""
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 
 from metagcttt_core import Agent, TTTConfig
@@ -41,6 +42,7 @@ class Query:
         adapted: Whether `expert` is an adapted one.
         adapting: Whether an adaptation is under way.
         adapted_at: Control step of the state that was last adapted to.
+        cache_key: Of the expert in the cache of experts.
         steps_done: Gradient steps done on it; counted by the thread that takes them.
     """
 
@@ -55,6 +57,7 @@ class Query:
     adapting: bool = False
     adapted_at: int | None = None
     steps_done: int = 0
+    cache_key: Hashable = None
 
     def serves(self, state: State) -> bool:
         """Whether the goal counts in `state`."""

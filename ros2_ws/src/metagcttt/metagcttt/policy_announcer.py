@@ -51,7 +51,13 @@ class PolicyAnnouncer:
         )
 
     def report(
-        self, query_id: int, episode_id: int, outcome: Outcome | None = None, reason: str = ''
+        self,
+        query_id: int,
+        episode_id: int,
+        outcome: Outcome | None = None,
+        reason: str = '',
+        *,
+        cached: bool = False,
     ) -> None:
         """What became of an adaptation."""
         report = report_message(
@@ -61,9 +67,11 @@ class PolicyAnnouncer:
             support=outcome.support if outcome else None,
             adaptation=outcome.adaptation if outcome else None,
             reason=reason,
+            cached=cached,
         )
         self._reports.publish(report)
         verdict = f'adapted in {report.adapt_ms:.0f} ms' if report.accepted else 'not adapted'
+        verdict = 'adapted before' if cached else verdict
         self._node.get_logger().info(
             f'goal {query_id}: {report.transitions} transitions of {report.kept_trajectories} of '
             f'{report.relevant_trajectories} trajectories in {report.filter_ms:.1f} ms; {verdict}'

@@ -14,6 +14,7 @@ from rclpy.timer import Timer
 from metagcttt.adaptation_worker import AdaptationWorker
 from metagcttt.converters import to_array
 from metagcttt.deployment import answer_query, Deployment, Outcome
+from metagcttt.expert_cache import ExpertCache
 from metagcttt.health import Health
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.pilot import choose, Query, State
@@ -70,6 +71,11 @@ class PolicySession:
         self._adaptation_finished = node.create_guard_condition(self._on_adaptation_finished)
         self._worker: AdaptationWorker[Query, Outcome] = AdaptationWorker(
             self._adaptation_finished.trigger, settings['threads']
+        )
+        self._cache = ExpertCache(
+            settings['cache_size'],
+            settings['cache_cell_m'],
+            deployment.trajectory_filter.config.position_dims,
         )
         self._say = PolicyAnnouncer(node)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -199,6 +205,7 @@ class PolicySession:
             lr=self._settings['adapt_lr'],
             batch_size=self._settings['adapt_batch_size'],
             early_stopping=self._settings['early_stopping'],
+            test_fraction=self._settings['test_fraction'],
             actor_only=self._settings['actor_only'],
             horizon=self._settings['horizon'] or None,
         )
@@ -221,6 +228,11 @@ class PolicySession:
 
     def _adapt(self, query: Query, state: State) -> None:
         query.adapted_at = state.step
+        query.cache_key = self._cache.key(state.observation, query.goal, query.config)
+        known = self._cache.find(query.cache_key)
+        if known is not None:
+            self._conclude(query, known, cached=True)
+            return
         answer = partial(
             answer_query,
             self._deployment,
@@ -252,13 +264,15 @@ class PolicySession:
             self._say.report(query.query_id, query.episode_id, reason=reason)
         self._proceed()
 
-    def _conclude(self, query: Query, outcome: Outcome) -> None:
-        self._monitor.adapt_ms.add(1000 * outcome.adaptation.seconds)
+    def _conclude(self, query: Query, outcome: Outcome, *, cached: bool = False) -> None:
+        if not cached:
+            self._monitor.adapt_ms.add(1000 * outcome.adaptation.seconds)
+            self._cache.keep(query.cache_key, outcome)
         self._monitor.remark = outcome.adaptation.reason
         query.expert = outcome.adaptation.agent
         query.adapted = outcome.adaptation.accepted
         query.steps_done = len(outcome.adaptation.train_losses)
-        self._say.report(query.query_id, query.episode_id, outcome)
+        self._say.report(query.query_id, query.episode_id, outcome, cached=cached)
 
     # --- what is published -------------------------------------------------------------------
 
