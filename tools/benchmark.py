@@ -6,12 +6,16 @@ import tyro
 
 from tools.benchmarks.report import Benchmark
 from tools.benchmarks.retrieval import RetrievalBenchmark
+from tools.benchmarks.ros import RosBenchmark
 
 _DESCRIPTION = """Measure speed against a baseline in the same run.
 
-Example: python -m tools.benchmark retrieval"""
+Examples: python -m tools.benchmark retrieval, python -m tools.benchmark ros"""
 
-BENCHMARKS: dict[str, Callable[..., Benchmark]] = {'retrieval': RetrievalBenchmark}
+BENCHMARKS: dict[str, Callable[..., Benchmark]] = {
+    'retrieval': RetrievalBenchmark,
+    'ros': RosBenchmark,
+}
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -14,7 +14,13 @@ from tools.node_process import NodeProcess
 from tests.ros.graph import ANY, goal_pose, Graph, Record
 
 EXECUTABLES = Path(get_package_prefix('metagcttt')) / 'lib' / 'metagcttt'
-NODES = ('goal_node', 'policy_node', 'sim_bridge_node')
+NODES = ('goal_node', 'policy_node', 'recorder_node', 'sim_bridge_node', 'visualization_node')
+
+
+@pytest.fixture(autouse=True)
+def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The recorder writes into the folder it is started in."""
+    monkeypatch.chdir(tmp_path)
 
 
 @pytest.fixture
@@ -44,11 +50,8 @@ def start(ros_domain: int) -> Iterator[Callable[..., subprocess.Popen]]:
 
 
 def arguments(node: str, checkpoint: Path, dataset: Path) -> list[str]:
-    given = {
-        'goal_node': [f'dataset:={dataset}'],
-        'policy_node': [f'dataset:={dataset}', f'checkpoint:={checkpoint}'],
-        'sim_bridge_node': [],
-    }[node]
+    both = [f'dataset:={dataset}', f'checkpoint:={checkpoint}']
+    given = {'goal_node': both[:1], 'policy_node': both, 'visualization_node': both}.get(node, [])
     return [word for parameter in given for word in ('-p', parameter)]
 
 

@@ -1,0 +1,51 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tools import benchmark
+from tools.benchmarks.state_source import Answers
+
+pytestmark = pytest.mark.ros
+
+
+def test_latency_and_missed_deadlines_by_hand() -> None:
+    answers = Answers(
+        sent={1: 0.00, 2: 0.02, 3: 0.04, 4: 0.06}, first={1: 0.005, 2: 0.05, 4: 0.065}
+    )
+    np.testing.assert_allclose(answers.latencies_ms(), [5.0, 30.0, 5.0])
+    assert answers.missed(0.02) == 2, 'the late one and the one that never came'
+
+
+@pytest.mark.slow
+def test_benchmark_measures_a_policy_process(tmp_path: Path, capsys) -> None:
+    out = tmp_path / 'bench'
+    benchmark.main(
+        [
+            'ros',
+            *('--out', str(out), '--duration-s', '2', '--idle-s', '1', '--goal-every-s', '0.5'),
+            *('--hidden', '16', '16', '--steps', '1', '5', '--repeats', '2'),
+            *('--stepping', 'lockstep'),
+        ]
+    )
+    report = json.loads((out / 'ros.json').read_text())
+    idle, adapting = report['results']['latency']
+    assert (idle['policy'], adapting['policy']) == ('idle', 'adapting')
+    assert adapting['states'] > 50
+    assert 0 < idle['median'] <= idle['p99'] <= idle['maximum']
+    costs = report['results']['goal_to_action']
+    assert [cost['K'] for cost in costs] == [1, 5]
+    for cost in costs:
+        assert cost['async: first action'] <= cost['async: first adapted']
+        # In hold there is no action before the expert's.
+        assert cost['hold: first action'] == cost['hold: first adapted']
+    assert report['settings']['hidden'] == [16, 16]
+    printed = capsys.readouterr().out
+    assert '| adapting |' in printed
+    assert '| K |' in printed
+
+
+def test_wrong_setting_is_refused(capsys) -> None:
+    with pytest.raises(SystemExit):
+        benchmark.main(['ros', '--stepping', 'fast'])
+    assert 'realtime' in capsys.readouterr().err
