@@ -127,11 +127,11 @@ class MazeClient(RobotCommander):
             self._goal_pose.publish(pose)
             self.wait(partial(self._is_answered, known), 'goal_pose', timeout_s)
             event = self._answers(known)[0]
-            if event.kind == EpisodeEvent.GOAL_REJECTED:
-                raise NoAnswerError(f'the goal was rejected: {event.reason}')
             if event.episode_id == task.episode_id:
+                if event.kind == EpisodeEvent.GOAL_REJECTED:
+                    raise NoAnswerError(f'the goal was rejected: {event.reason}')
                 return event
-            # The goal node had not seen the new episode's first state yet.
+            # The goal node has not seen the new episode's first state yet.
             if time.monotonic() > deadline:
                 raise NoAnswerError('the goal node does not see the new episode')
 
