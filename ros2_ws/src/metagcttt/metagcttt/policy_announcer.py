@@ -10,7 +10,7 @@ from std_msgs.msg import Header
 from metagcttt.converters import action_message, report_message
 from metagcttt.deployment import Outcome
 from metagcttt.pilot import Command, Query, State
-from metagcttt.qos import COMMAND, EVENTS, LATCHED
+from metagcttt.qos import COMMAND, EVENTS, LATCHED, sent_to_recorders
 
 STATUS_PERIOD_S = 0.2
 
@@ -26,7 +26,9 @@ class PolicyAnnouncer:
         """Connect through `node`."""
         self.instance = secrets.randbits(64)
         self._node = node
-        self._actions = node.create_lifecycle_publisher(ActionCommand, 'action', COMMAND)
+        self._actions = node.create_lifecycle_publisher(
+            ActionCommand, 'action', sent_to_recorders(COMMAND)
+        )
         self._reports = node.create_lifecycle_publisher(AdaptationReport, 'adaptation', EVENTS)
         self._statuses = node.create_lifecycle_publisher(PolicyStatus, 'policy_status', LATCHED)
         self._last_status = PolicyStatus()

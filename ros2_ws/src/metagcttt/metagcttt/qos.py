@@ -42,6 +42,20 @@ def state_profile(stepping: str) -> QoSProfile:
     return LATCHED if stepping == 'lockstep' else SENSOR
 
 
+def sent_to_recorders(profile: QoSProfile) -> QoSProfile:
+    """The profile of a publisher whose every message counts for those who record it.
+
+    With a depth of 1 a newer message takes the place of one that a slow reader has not got yet. A
+    reader with a depth of 1 still sees the newest alone.
+    """
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=20,
+        reliability=profile.reliability,
+        durability=profile.durability,
+    )
+
+
 def recording_profile(publishers: Sequence[QoSProfile]) -> QoSProfile:
     """The best quality that all publishers of a topic offer; nothing waits to be taken in vain."""
     reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in publishers)

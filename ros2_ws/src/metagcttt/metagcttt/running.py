@@ -58,6 +58,12 @@ def run(
         get_logger('metagcttt').fatal(f'cannot start: {error}')
         rclpy.try_shutdown()
         return 1
+    except ImportError:
+        # The signal also ended the process in which glfw looks for its library.
+        if not stop.is_set():
+            raise
+        rclpy.try_shutdown()
+        return 0
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:

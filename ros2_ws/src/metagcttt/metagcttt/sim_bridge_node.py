@@ -30,7 +30,7 @@ from metagcttt.health import Health
 from metagcttt.pacing import Pacer
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import SIM_BRIDGE_NODE
-from metagcttt.qos import COMMAND, EVENTS, LATCHED, SENSOR, state_profile
+from metagcttt.qos import COMMAND, EVENTS, LATCHED, SENSOR, sent_to_recorders, state_profile
 from metagcttt.sim_health import SimMonitor
 from metagcttt.vectors import vector_fault
 
@@ -73,7 +73,7 @@ class SimBridgeNode(Node):
         self._paused = bool(self._settings['start_paused'])
         self._awaiting: NDArray[np.float64] | None = None  # lockstep: arrived while paused
 
-        profile = state_profile(self._settings['stepping'])
+        profile = sent_to_recorders(state_profile(self._settings['stepping']))
         self._states = self.create_publisher(MazeState, 'state', profile)
         self._events = self.create_publisher(EpisodeEvent, 'episode', EVENTS)
         self._map = self.create_publisher(OccupancyGrid, 'map', LATCHED)
