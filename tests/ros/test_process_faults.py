@@ -1,0 +1,202 @@
+"""Faults among real processes: killed and restarted nodes, goals under load, clean ends."""
+
+from collections.abc import Callable
+import os
+from pathlib import Path
+import signal
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from metagcttt.commander import NoAnswerError, RobotCommander
+from metagcttt_interfaces.action import ReachGoal
+from metagcttt_interfaces.msg import MazeState
+import numpy as np
+import pytest
+from tools.node_process import NodeProcess
+
+from tests.ros.graph import ANY, goal_pose, Graph, Record, RELIABLE
+
+pytestmark = [pytest.mark.slow, pytest.mark.mujoco]
+
+GOAL = (20.0, 20.0)
+RESUME_S = 5.0
+END_S = 2.0
+
+
+def allowed(seconds: float) -> float:
+    """What counts as `seconds` where there is more work than cores."""
+    return seconds * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+
+
+class Robot:
+    """The three nodes as processes, in realtime, and a program that uses them."""
+
+    def __init__(
+        self, graph: Graph, start: Callable[..., NodeProcess], dataset: Path, checkpoint: Path
+    ) -> None:
+        self.graph = graph
+        self._start = start
+        self._parameters = {
+            'sim_bridge_node': {'speed_factor': 5.0, 'diagnostics_period_s': 0.1},
+            'goal_node': {'dataset': dataset, 'max_steps': 1000000},
+            'policy_node': {
+                'dataset': dataset,
+                'checkpoint': checkpoint,
+                'adapt_steps': 5,
+                'adapt_batch_size': 32,
+                'diagnostics_period_s': 0.1,
+            },
+        }
+        self.record = Record(graph, ANY)
+        self.diagnostics = graph.collect(DiagnosticArray, '/diagnostics', RELIABLE)
+        self.nodes: dict[str, NodeProcess] = {}
+        self.commander = RobotCommander(context=graph.context, executor=graph._executor)
+
+    def start(self, *names: str, **parameters) -> None:
+        for name in names or self._parameters:
+            given = {**self._parameters[name], **parameters}
+            self.nodes[name] = self._start(name, **given)
+
+    def drive(self, timeout_s: float) -> ReachGoal.Feedback:
+        """Send goals until one is driven to by the adapted policy."""
+        deadline = time.monotonic() + timeout_s
+        while time.monotonic() < deadline:
+            try:
+                # The start of a task is a place where the dataset has trajectories.
+                self.commander.set_task(1, timeout_s=1.0)
+                sent = self.commander.send(GOAL, timeout_s=1.0)
+            except NoAnswerError:
+                continue  # a request to a node that was killed is lost
+            end = min(time.monotonic() + 2.0, deadline)
+            while not sent.is_done() and time.monotonic() < end:
+                if sent.feedback is not None and sent.feedback.adapted:
+                    return sent.feedback
+        raise AssertionError(f'no service within {timeout_s:g} s')
+
+    def diagnosed(self, node: str, message: str) -> None:
+        self.diagnostics.clear()
+        self.graph.wait(
+            lambda: any(
+                status.name == node and message in status.message
+                for array in self.diagnostics
+                for status in array.status
+            ),
+            f'{node}: {message}',
+            timeout_s=40,
+        )
+
+
+@pytest.fixture
+def robot(graph: Graph, start_process, dataset_file: Path, checkpoint_folder: Path):
+    robot = Robot(graph, start_process, dataset_file, checkpoint_folder)
+    yield robot
+    robot.commander.destroy_node()
+
+
+@pytest.mark.parametrize('name', ['sim_bridge_node', 'goal_node', 'policy_node'])
+def test_killed_node_resumes_its_service_after_a_restart(robot: Robot, name: str) -> None:
+    robot.start()
+    robot.drive(timeout_s=60)
+    robot.nodes[name].stop(signal_number=signal.SIGKILL)
+    if name == 'policy_node':
+        robot.diagnosed('/sim_bridge_node', 'the action is zero: none has come lately')
+    if name == 'sim_bridge_node':
+        robot.diagnosed('/policy_node', 'the action is zero: no state for')
+    robot.start(name)
+    process = robot.nodes[name]
+    began = time.monotonic()
+    robot.graph.wait(lambda: '[INFO]' in process.log.read_text(), 'the node', timeout_s=60)
+    start_s = time.monotonic() - began
+    robot.drive(timeout_s=allowed(RESUME_S))
+    print(f'{name}: started in {start_s:.1f} s, served {time.monotonic() - began:.1f} s after')
+
+
+def test_goal_that_changes_every_100_ms_ends_well(robot: Robot) -> None:
+    robot.start('sim_bridge_node', 'goal_node')
+    robot.start('policy_node', adapt_steps=2000)
+    robot.graph.wait(lambda: robot.record.actions, 'the first action', timeout_s=60)
+    goals = [(0.0, 4.0), (4.0, 0.0)] * 15
+    for xy in goals:
+        robot.graph.publish('goal_pose', goal_pose(*xy))
+        robot.graph.wait_for(0.1)
+    robot.nodes['policy_node'].check()
+    accepted = [query.query_id for query in robot.record.queries if query.active]
+    last = accepted[-1]
+    known = len(robot.record.actions)
+    robot.graph.wait(
+        lambda: any(a.query_id == last for a in robot.record.actions[known:]), 'the last goal'
+    )
+    cancelled = robot.graph.wait(
+        lambda: len(ids := {r.query_id for r in robot.record.reports}) >= last - 1 and ids,
+        'a report on every superseded goal',
+    )
+    assert cancelled >= set(accepted[:-1])
+    assert all(np.isfinite(action.values).all() for action in robot.record.actions)
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM], ids=['ctrl-c', 'sigterm'])
+def test_policy_ends_cleanly_while_it_adapts(robot: Robot, number: int) -> None:
+    robot.start('sim_bridge_node', 'goal_node')
+    robot.start('policy_node', adapt_steps=10000, adapt_batch_size=1024)
+    robot.graph.wait(lambda: robot.record.actions, 'the first action', timeout_s=60)
+    robot.commander.set_task(1)
+    sent = robot.commander.send(GOAL)
+    robot.graph.wait(
+        lambda: sent.feedback and sent.feedback.phase == ReachGoal.Feedback.ADAPTING,
+        'the adaptation',
+        timeout_s=60,
+    )
+    for name in ('policy_node', 'goal_node', 'sim_bridge_node'):
+        began = time.monotonic()
+        assert robot.nodes[name].stop(signal_number=number) == 0
+        elapsed_s = time.monotonic() - began
+        print(f'{name} ended in {elapsed_s:.2f} s')
+        assert elapsed_s < allowed(END_S)
+
+
+def test_second_policy_process_stands_still_until_it_is_alone(robot: Robot) -> None:
+    robot.start()
+    robot.drive(timeout_s=60)
+    first = robot.nodes['policy_node']
+    robot.start('policy_node')
+    robot.diagnosed('/policy_node', 'another policy node acts in this graph')
+    robot.record.actions.clear()
+    robot.graph.wait(lambda: len(robot.record.actions) > 4, 'actions')
+    assert not any(any(action.values) for action in robot.record.actions[-4:])
+    first.stop(signal_number=signal.SIGKILL)
+    robot.drive(timeout_s=allowed(RESUME_S))
+
+
+def test_control_period_holds_while_adapting(
+    graph: Graph, start_process, dataset_file: Path, checkpoint_folder: Path
+) -> None:
+    start_process('goal_node', dataset=dataset_file)
+    start_process(
+        'policy_node', dataset=dataset_file, checkpoint=checkpoint_folder, adapt_steps=10000
+    )
+    record = Record(graph, ANY)
+    states = graph.node.create_publisher(MazeState, 'state', ANY)
+    commander = RobotCommander(context=graph.context, executor=graph._executor)
+    graph.wait(lambda: states.get_subscription_count() >= 3, 'the nodes', timeout_s=60)
+    diagnostics = graph.collect(DiagnosticArray, '/diagnostics', RELIABLE)
+    states.publish(MazeState(episode_id=1, observation=[0.0, 0.0]))
+    graph.wait(lambda: record.actions, 'the first action')
+    sent = commander.send(GOAL)
+    assert sent.accepted, sent.result()
+    for step in range(1, 200):
+        states.publish(MazeState(episode_id=1, step=step, observation=[0.0, 0.0]))
+        graph.wait_for(0.02)
+    assert sent.feedback.phase == ReachGoal.Feedback.ADAPTING
+    answered = {action.step for action in record.actions}
+    assert len(answered) > 150
+    newest: DiagnosticStatus = next(
+        status
+        for array in reversed(diagnostics)
+        for status in array.status
+        if status.name == '/policy_node'
+    )
+    figures = {pair.key: pair.value for pair in newest.values}
+    print(figures)
+    assert newest.level == DiagnosticStatus.WARN
+    assert float(figures['latency_median_ms']) < 20
+    commander.destroy_node()
