@@ -110,7 +110,7 @@ def adapt(
     state = optimizer_state if config.optimizer_state == 'pretrained' else None
     result = run_inner_loop(
         agent,
-        (train_batches.sample(config.batch_size, rng) for _ in range(config.steps)),
+        train_batches.steps(config.steps, config.batch_size, rng),
         lr=config.lr,
         optimizer=config.optimizer,
         optimizer_state=state,

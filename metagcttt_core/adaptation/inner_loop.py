@@ -1,6 +1,6 @@
 """The inner loop U^K: gradient steps from base weights to expert weights (paper, equation 5)."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 import math
 from typing import Any
@@ -64,39 +64,66 @@ def run_inner_loop(
     agent = base.clone()
     parameters = list(agent.trained_parameters(actor_only=actor_only))
     stepper = make_optimizer(optimizer, parameters, lr, optimizer_state)
+    best = None if test_batch is None else BestStep(agent, test_batch, actor_only)
     train_losses: list[torch.Tensor] = []
-    test_losses: list[float] = []
-    best_step, best_loss, best_weights = 0, float('inf'), None
-
-    def test(step: int, batch: TensorBatch) -> None:
-        nonlocal best_step, best_loss, best_weights
-        with torch.no_grad():
-            loss = agent.losses(batch, actor_only=actor_only)[0].item()
-        test_losses.append(loss)
-        rank = loss if math.isfinite(loss) else math.inf
-        if step == 0 or rank < best_loss:
-            best_step, best_loss = step, rank
-            best_weights = [tensor.detach().clone() for tensor in agent.state_dict().values()]
-
-    step = 0
-    if test_batch is not None:
-        test(step, test_batch)
     for step, batch in enumerate(batches, start=1):
         if should_stop is not None and should_stop():
             raise AdaptationCancelled(f'cancelled before inner step {step}')
         loss, _ = gradient_step(agent, stepper, parameters, batch, actor_only=actor_only)
         train_losses.append(loss)
-        if test_batch is not None:
-            test(step, test_batch)
-
+        if best is not None:
+            best.test(step)
     stepper.zero_grad()
-    if best_weights is not None:
-        with torch.no_grad():
-            for tensor, best in zip(agent.state_dict().values(), best_weights, strict=True):
-                tensor.copy_(best)
+    if best is not None:
+        best.restore()
     return InnerLoopResult(
         agent=agent,
         train_losses=torch.stack(train_losses).tolist() if train_losses else [],
-        test_losses=test_losses,
-        best_step=step if test_batch is None else best_step,
+        test_losses=[] if best is None else best.losses,
+        best_step=len(train_losses) if best is None else best.step,
     )
+
+
+class BestStep:
+    """Test-aware early stopping (paper, equation 9).
+
+    Attributes:
+        losses: The test losses so far.
+        step: k*, the step of the smallest one.
+    """
+
+    def __init__(self, agent: Agent, test_batch: TensorBatch, actor_only: bool) -> None:
+        """Take the test loss of `agent` as it is, after no steps."""
+        self._agent = agent
+        self._batch = test_batch
+        self._actor_only = actor_only
+        self._weights = [weight.detach() for weight in agent.parameters()]
+        self._best_weights = [weight.clone() for weight in self._weights]
+        self._smallest = math.inf
+        self.losses: list[float] = []
+        self.step = 0
+        self.test(0)
+
+    @torch.no_grad()
+    def test(self, step: int) -> None:
+        """Take the test loss after `step` steps and keep the weights if they are the best."""
+        loss = self._agent.losses(self._batch, actor_only=self._actor_only)[0].item()
+        self.losses.append(loss)
+        if math.isfinite(loss) and loss < self._smallest:
+            self.step, self._smallest = step, loss
+            _copy(self._weights, self._best_weights)
+
+    def restore(self) -> None:
+        """Give the agent the weights of the best step."""
+        _copy(self._best_weights, self._weights)
+
+
+@torch.no_grad()
+def copy_weights(source: Agent, target: Agent) -> None:
+    """Give `target` the weights of `source`, an agent of the same shape."""
+    _copy(list(source.parameters()), list(target.parameters()))
+
+
+def _copy(weights: Sequence[torch.Tensor], into: Sequence[torch.Tensor]) -> None:
+    for weight, copied in zip(weights, into, strict=True):
+        copied.copy_(weight)

@@ -107,7 +107,8 @@ class Agent(nn.Module, ABC):
         return (-0.5 * (error / log_std.exp()).square() - log_std - _HALF_LOG_TWO_PI).sum(-1), mean
 
     def _log_std(self) -> Tensor:
-        return self.actor.get_parameter('log_stds').clamp(-5, 2)
+        # Not by `get_parameter`: `functional_call` puts plain tensors in the parameters' places.
+        return dict(self.actor.named_parameters())['log_stds'].clamp(-5, 2)
 
     @torch.inference_mode()
     def act(

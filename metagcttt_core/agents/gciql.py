@@ -13,11 +13,13 @@ from torch.func import functional_call
 from metagcttt_core.agents.agent import Agent, AgentSettings, TensorBatch
 from metagcttt_core.agents.networks import MLP
 
+ActorLoss = Literal['ddpgbc', 'awr', 'bc']
+
 
 class GCIQLSettings(AgentSettings):
     """Settings of GCIQL."""
 
-    actor_loss: Literal['ddpgbc', 'awr', 'bc'] = Field('ddpgbc', description='policy extraction')
+    actor_loss: ActorLoss = Field('ddpgbc', description='policy extraction')
     alpha: float = Field(
         0.3, ge=0, description='ddpgbc: weight of cloning; awr: inverse temperature of advantages'
     )

@@ -46,7 +46,8 @@ class MLP(nn.Module):
             x = functional.gelu(self.get_submodule(f'fc{index}')(x), approximate='tanh')
             if self.layer_norm:
                 x = self.get_submodule(f'ln{index}')(x)
-        return self.get_submodule(self.head_name)(x)
+        # As wide as the inputs, also where autocast computes the layers in bfloat16.
+        return self.get_submodule(self.head_name)(x).to(inputs.dtype)
 
 
 def _linear(

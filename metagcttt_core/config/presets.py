@@ -1,4 +1,4 @@
-"""Named settings, kept as YAML beside this file."""
+"""Named settings: YAML files beside this one, and the paper's."""
 
 from difflib import get_close_matches
 from importlib.resources import files
@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+
+from metagcttt_core.config.paper import paper_presets
 
 
 def _preset_files() -> dict[str, Any]:
@@ -19,7 +21,7 @@ def _preset_files() -> dict[str, Any]:
 
 def preset_names() -> list[str]:
     """Names that `load_preset` accepts, sorted."""
-    return list(_preset_files())
+    return sorted([*_preset_files(), *paper_presets()])
 
 
 def load_preset(name_or_path: str | Path) -> dict[str, Any]:
@@ -37,12 +39,15 @@ def load_preset(name_or_path: str | Path) -> dict[str, Any]:
         if not source.is_file():
             raise ValueError(f'preset file {source} does not exist')
     else:
-        presets = _preset_files()
+        presets, from_paper = _preset_files(), paper_presets()
+        if name_or_path in from_paper:
+            return from_paper[str(name_or_path)]
         if name_or_path not in presets:
-            close = get_close_matches(str(name_or_path), presets, n=1)
+            close = get_close_matches(str(name_or_path), preset_names(), n=1)
             hint = f'; did you mean {close[0]!r}?' if close else ''
             raise ValueError(
-                f'no preset {str(name_or_path)!r}{hint} (known: {", ".join(presets)})'
+                f'no preset {str(name_or_path)!r}{hint} (known: {", ".join(presets)} '
+                'and those of python -m tools.presets)'
             )
         source = presets[str(name_or_path)]
     try:

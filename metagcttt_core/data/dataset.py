@@ -6,7 +6,7 @@ from typing import Self
 
 import numpy as np
 
-from metagcttt_core.data import npz
+from metagcttt_core.data import minari, npz
 from metagcttt_core.data.errors import DatasetError
 
 _CHUNK_ROWS = 1 << 20
@@ -107,22 +107,27 @@ class TrajectoryDataset:
 
     @classmethod
     def load(cls, path: str | Path, *, memory_map: bool | None = None) -> Self:
-        """Read a dataset in OGBench's npz format.
+        """Read a dataset in OGBench's npz format, or a Minari dataset.
 
         Args:
             path: The `.npz` file. Its arrays `observations`, `actions` and `terminals` are
-                required.
+                required. Or the folder or HDF5 file of a Minari dataset; see
+                `minari.read_arrays`.
             memory_map: Keep the rows on disk (unpacked once, beside the file) instead of in
                 memory. By default, for files that unpack to more than `npz.MEMORY_MAP_BYTES`.
+                A Minari dataset is always read into memory.
 
         Raises:
             DatasetError: If the file is missing, truncated, pickled, or its content is refused by
                 `from_arrays`; the message names the file, the field and the row.
         """
         path = Path(path)
-        arrays = npz.read_arrays(
-            path, required=('observations', 'actions', 'terminals'), memory_map=memory_map
-        )
+        if minari.is_minari(path):
+            arrays = minari.read_arrays(path)
+        else:
+            arrays = npz.read_arrays(
+                path, required=('observations', 'actions', 'terminals'), memory_map=memory_map
+            )
         fields = {name: arrays.pop(name) for name in ('observations', 'actions', 'terminals')}
         arrays.pop('next_observations', None)  # always the following row
         return cls.from_arrays(**fields, extras=arrays, source=path)

@@ -79,16 +79,37 @@ class GoalRelabeller:
             `gc_negative`). Without value goals in the config, only `observations`, `actions` and
             `actor_goals`.
         """
+        return self.gather(rows, **self.draw_goals(rows, rng))
+
+    def draw_goals(self, rows: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """Rows of goals for the transitions at `rows` (B,): `value_rows`, `actor_rows`."""
+        goals = {'value_rows': self.config.value, 'actor_rows': self.config.actor}
+        return {
+            name: self.goal_rows(rows, distribution, rng)
+            for name, distribution in goals.items()
+            if distribution is not None
+        }
+
+    def gather(
+        self, rows: np.ndarray, actor_rows: np.ndarray, value_rows: np.ndarray | None = None
+    ) -> Batch:
+        """The batch of the transitions at `rows` with goals at the other rows.
+
+        Args:
+            rows: (..., B) rows that have a successor; the arrays of the batch get the same
+                leading axes.
+            actor_rows: (..., B) rows of the actor goals.
+            value_rows: (..., B) rows of the value goals, if there are such.
+        """
         data = self.dataset
         batch = {'observations': data.observations[rows], 'actions': data.actions[rows]}
-        if self.config.value is not None:
-            value_rows = self.goal_rows(rows, self.config.value, rng)
+        if value_rows is not None:
             success = (value_rows == rows).astype(np.float32)
             batch['next_observations'] = data.observations[rows + 1]
             batch['value_goals'] = data.observations[value_rows]
             batch['rewards'] = success - np.float32(self.config.gc_negative)
             batch['masks'] = 1 - success
-        batch['actor_goals'] = data.observations[self.goal_rows(rows, self.config.actor, rng)]
+        batch['actor_goals'] = data.observations[actor_rows]
         return batch
 
     def goal_rows(

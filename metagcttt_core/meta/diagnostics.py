@@ -1,46 +1,85 @@
 """What the paper looks at while post-training: k*, losses, drift, support sizes."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
 import torch
 
 from metagcttt_core.agents.agent import Agent
-from metagcttt_core.meta.post_train import OuterStep
+from metagcttt_core.meta.report import OuterStep, TaskReport
 
 
-class OuterStepScalars:
-    """Collects outer steps and returns their means by name."""
+@dataclass(frozen=True)
+class Record:
+    """Some outer steps in numbers, by name.
+
+    Attributes:
+        means: Over the tasks; None where there is nothing to average. And the drift.
+        samples: A value for each task: k*, support size, redraws.
+        curves: Mean loss over the inner steps (paper, figure 8).
+    """
+
+    means: dict[str, float | None]
+    samples: dict[str, list[int]]
+    curves: dict[str, list[float]]
+
+
+class Diagnostics:
+    """Collects outer steps into records."""
 
     def __init__(self, initial: Agent) -> None:
         """Measure drift from the weights of `initial`."""
         self._initial = [weight.detach().clone() for weight in initial.state_dict().values()]
-        self._steps: list[OuterStep] = []
+        self._tasks: list[TaskReport] = []
 
     def add(self, outer: OuterStep) -> None:
-        """Take an outer step into the next means."""
-        self._steps.append(outer)
+        """Take an outer step into the next record."""
+        self._tasks += outer.tasks
 
-    def means(self, agent: Agent) -> dict[str, float | None]:
-        """Means over the steps added since the last call, and the drift of `agent`."""
-        tasks = [task for outer in self._steps for task in outer.tasks]
-        results = [result for outer in self._steps for result in outer.results]
-        self._steps = []
-        best_steps = [result.best_step for result in results]
+    def record(self, agent: Agent) -> Record:
+        """The steps added since the last record, and the drift of `agent`."""
+        tasks, self._tasks = self._tasks, []
+        means = {**_means(tasks), 'meta/drift': self._drift(agent)}
+        samples = {
+            'inner/best_steps': [task.best_step for task in tasks],
+            'task/support_sizes': [task.num_transitions for task in tasks],
+            'task/redraw_counts': [task.redraws for task in tasks],
+        }
+        curves = {
+            'inner/train_loss_curve': [task.train_losses for task in tasks],
+            'inner/test_loss_curve': [task.test_losses for task in tasks if task.test_losses],
+        }
+        return Record(
+            means,
+            samples,
+            {name: np.mean(lines, axis=0).tolist() for name, lines in curves.items() if lines},
+        )
+
+    def _drift(self, agent: Agent) -> float:
         weights = agent.state_dict().values()
         squared = [(a - b).square().sum() for a, b in zip(weights, self._initial, strict=True)]
-        tested = [result.test_losses for result in results if result.test_losses]
-        return {
-            'inner/best_step': _mean(best_steps),
-            'inner/rejected': _mean([step == 0 for step in best_steps]),
-            'inner/first_train_loss': _mean([result.train_losses[0] for result in results]),
-            'inner/last_train_loss': _mean([result.train_losses[-1] for result in results]),
-            'inner/first_test_loss': _mean([losses[0] for losses in tested]),
-            'inner/best_test_loss': _mean([min(losses) for losses in tested]),
-            'inner/last_test_loss': _mean([losses[-1] for losses in tested]),
-            'task/support_transitions': _mean([task.num_transitions for task in tasks]),
-            'task/redraws': _mean([task.redraws for task in tasks]),
-            'task/filter_ms': _mean([task.train.milliseconds for task in tasks]),
-            'meta/drift': float(torch.stack(squared).sum().sqrt()),
-        }
+        return float(torch.stack(squared).sum().sqrt())
 
 
-def _mean(values: list) -> float | None:
+def _means(tasks: Sequence[TaskReport]) -> dict[str, float | None]:
+    tested = [task.test_losses for task in tasks if task.test_losses]
+    return {
+        'inner/best_step': _mean([task.best_step for task in tasks]),
+        'inner/rejected': _mean([task.best_step == 0 for task in tasks]),
+        'inner/one_step': _mean([task.best_step == 1 for task in tasks]),
+        'inner/first_train_loss': _mean([task.train_losses[0] for task in tasks]),
+        'inner/last_train_loss': _mean([task.train_losses[-1] for task in tasks]),
+        'inner/first_test_loss': _mean([losses[0] for losses in tested]),
+        'inner/best_test_loss': _mean([min(losses) for losses in tested]),
+        'inner/last_test_loss': _mean([losses[-1] for losses in tested]),
+        'inner/initial_loss': _mean([task.initial_loss for task in tasks]),
+        'inner/expert_loss': _mean([task.expert_loss for task in tasks]),
+        'task/support_transitions': _mean([task.num_transitions for task in tasks]),
+        'task/redraws': _mean([task.redraws for task in tasks]),
+        'task/filter_ms': _mean([task.filter_ms for task in tasks]),
+    }
+
+
+def _mean(values: Sequence[float]) -> float | None:
     return sum(values) / len(values) if values else None

@@ -1,37 +1,22 @@
 """Meta-post-training (paper, Algorithm 1): prepare a policy for test-time training."""
 
-from collections.abc import Callable, Iterator
-import copy
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from metagcttt_core.adaptation.batches import QueryBatches
-from metagcttt_core.adaptation.inner_loop import InnerLoopResult, run_inner_loop
-from metagcttt_core.agents.agent import Agent, TensorBatch
+from metagcttt_core.agents.agent import Agent
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.meta.config import MetaConfig
-from metagcttt_core.meta.tasks import MetaTask, TaskSampler
-from metagcttt_core.meta.updates import Expert, GRADIENT_UPDATES, META_UPDATES
+from metagcttt_core.meta.experts import adapt_to_tasks, make_inner_loops
+from metagcttt_core.meta.health import check_finite
+from metagcttt_core.meta.parallel import first_process, own_tasks, reports_of_all
+from metagcttt_core.meta.report import OuterStep, TaskReport
+from metagcttt_core.meta.tasks import TaskSampler
+from metagcttt_core.meta.updates import GRADIENT_UPDATES, META_UPDATES
 from metagcttt_core.retrieval.trajectory_filter import TrajectoryFilter
 from metagcttt_core.training.optimizers import make_optimizer
 from metagcttt_core.training.run import TrainingRun
-
-
-@dataclass(frozen=True)
-class OuterStep:
-    """What happened in one outer step, for logs and diagnostics.
-
-    Attributes:
-        step: Outer steps done.
-        tasks: The meta-batch.
-        results: The inner loop of each task.
-    """
-
-    step: int
-    tasks: list[MetaTask]
-    results: list[InnerLoopResult]
 
 
 def post_train(
@@ -42,8 +27,12 @@ def post_train(
     *,
     run: TrainingRun | None = None,
     on_step: Callable[[OuterStep, Agent], Any] = lambda outer, base: None,
+    cuda_graphs: bool = True,
 ) -> Agent:
     """Post-train a copy of `agent` so that a few steps of test-time training make it an expert.
+
+    With an initialised `torch.distributed` process group, the tasks of a meta-batch are divided
+    among its processes; all of them return the same policy.
 
     Args:
         agent: The pre-trained policy theta_0; not changed.
@@ -51,10 +40,16 @@ def post_train(
         config: Algorithm, N, K, B, alpha, beta and the rest.
         seed: Of tasks, splits and batches.
         run: Checkpoints and resume.
-        on_step: Told about each outer step and the base policy after it.
+        on_step: Told about each outer step and the base policy after it, in the first process.
+        cuda_graphs: On a GPU, replay captured inner steps where tasks are adapted one by one.
 
     Returns:
         The post-trained policy theta.
+
+    Raises:
+        DivergedError: When a loss or a weight is no longer finite. `run` keeps the checkpoint
+            before that.
+        TaskError: If no task can be found, or there are more processes than tasks.
     """
     base = agent.clone()
     run = run or TrainingRun('post_train', {})
@@ -66,48 +61,28 @@ def post_train(
     if config.algorithm in GRADIENT_UPDATES:
         parameters = base.trained_parameters(actor_only=config.actor_only)
         outer_optimizer = make_optimizer('adam', parameters, config.meta_lr)
+    numbers = own_tasks(config.meta_batch_size)
+    inner_loops = make_inner_loops(base, config, cuda_graphs=cuda_graphs)
 
     for step in range(run.restore(base, outer_optimizer), config.outer_steps):
-        rng = np.random.default_rng((seed, step))
-        tasks = [sampler.sample(rng, base.value_fn) for _ in range(config.meta_batch_size)]
-        experts = [adapt_to_task(base, dataset, task, config, rng) for task in tasks]
+        # A generator for each task, whichever process draws it.
+        rngs = [np.random.default_rng((seed, step, number)) for number in numbers]
+        value_fn = base.value_fn
+        tasks = [sampler.sample(rng, value_fn) for rng in rngs]
+        experts = adapt_to_tasks(base, dataset, tasks, config, rngs, inner_loops)
         meta_update(base, experts, config, outer_optimizer)
-        on_step(OuterStep(step + 1, tasks, [expert.result for expert in experts]), base)
+        reports = [
+            TaskReport.of(
+                task,
+                expert.result,
+                initial_loss=expert.loss_of(agent, config),
+                expert_loss=expert.loss_of(expert.result.agent, config),
+            )
+            for task, expert in zip(tasks, experts, strict=True)
+        ]
+        outer = OuterStep(step + 1, reports_of_all(reports))
+        check_finite(outer, base)
+        if first_process():
+            on_step(outer, base)
         run.step_done(base, outer_optimizer, step + 1, config.outer_steps)
     return base
-
-
-def adapt_to_task(
-    base: Agent,
-    dataset: TrajectoryDataset,
-    task: MetaTask,
-    config: MetaConfig,
-    rng: np.random.Generator,
-) -> Expert:
-    """Lines 7 to 10 of Algorithm 1: K steps from theta on the task's train split."""
-    train, test = (
-        QueryBatches(
-            base,
-            dataset,
-            split.indices,
-            task.goal,
-            fix_actor_goal=config.fix_actor_goal,
-            ratio=config.ratio,
-        )
-        for split in (task.train, task.test)
-    )
-    test_batch = test.all(rng)
-
-    def train_batches(rng: np.random.Generator) -> Iterator[TensorBatch]:
-        return (train.sample(config.batch_size, rng) for _ in range(config.inner_steps))
-
-    before = copy.deepcopy(rng)
-    result = run_inner_loop(
-        base,
-        train_batches(rng),
-        lr=config.inner_lr,
-        optimizer=config.optimizer,
-        test_batch=test_batch if config.early_stopping else None,
-        actor_only=config.actor_only,
-    )
-    return Expert(result, test_batch, lambda: train_batches(copy.deepcopy(before)))

@@ -3,9 +3,10 @@
 from collections.abc import Iterable
 
 import torch
-from torch import nn, Tensor
+from torch import Tensor
 from torch.func import functional_call
 
+from metagcttt_core.adaptation.functional import AgentLoss
 from metagcttt_core.agents.agent import Agent, TensorBatch
 from metagcttt_core.training.optimizers import OptimizerName
 
@@ -40,7 +41,7 @@ def meta_gradient(
         One tensor for each of `base.trained_parameters`.
     """
     agent = base.clone()
-    loss_of = _Loss(agent, actor_only)
+    loss_of = AgentLoss(agent, actor_only)
     trained = {id(weight) for weight in agent.trained_parameters(actor_only=actor_only)}
     names = [name for name, weight in loss_of.named_parameters() if id(weight) in trained]
     own = dict(loss_of.named_parameters())
@@ -57,18 +58,6 @@ def meta_gradient(
         weights = step(weights, gradients)
     loss = functional_call(loss_of, dict(zip(names, weights, strict=True)), (test_batch,))
     return list(torch.autograd.grad(loss, initial))
-
-
-class _Loss(nn.Module):
-    """An agent's loss as a module's forward pass, which `functional_call` can give weights."""
-
-    def __init__(self, agent: Agent, actor_only: bool) -> None:
-        super().__init__()
-        self.agent = agent
-        self._actor_only = actor_only
-
-    def forward(self, batch: TensorBatch) -> Tensor:
-        return self.agent.losses(batch, actor_only=self._actor_only)[0]
 
 
 class _SGD:

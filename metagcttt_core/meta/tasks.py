@@ -11,6 +11,10 @@ from metagcttt_core.retrieval.trajectory_filter import TrajectoryFilter, ValueFu
 _MAX_REDRAWS = 10_000
 
 
+class TaskError(ValueError):
+    """Tasks that cannot be found in the dataset, or divided among processes."""
+
+
 @dataclass(frozen=True)
 class MetaTask:
     """One task of the outer loop.
@@ -45,7 +49,7 @@ class TaskSampler:
         """One task whose filtered dataset can be split; others are redrawn.
 
         Raises:
-            ValueError: If no drawn pair of states has usable data between them.
+            TaskError: If no drawn pair of states has usable data between them.
         """
         dataset: TrajectoryDataset = self._filter.dataset
         for redraws in range(_MAX_REDRAWS):
@@ -55,7 +59,7 @@ class TaskSampler:
             train, test = support.split(self._test_fraction, self._max_test, rng)
             if len(test):
                 return MetaTask(goal, train, test, len(support), redraws)
-        raise ValueError(
+        raise TaskError(
             f'none of {_MAX_REDRAWS} random state-goal pairs has trajectories between them: '
             'use a larger epsilon, or a critic-based filter for short trajectories'
         )

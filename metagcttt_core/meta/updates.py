@@ -1,35 +1,20 @@
 """The meta-updates: from adapted experts back to the base policy (paper, section 4).
 
-Each takes the base agent, changed in place, and one `Expert` per task of the meta-batch. Adding
-one is a function and a line in `META_UPDATES`.
+Each takes the base agent, changed in place, and one `Expert` per task of the meta-batch that this
+process adapted to; means are over the tasks of all processes. Adding one is a function and a line
+in `META_UPDATES`.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from itertools import islice
 
 import torch
 
-from metagcttt_core.adaptation.inner_loop import InnerLoopResult
-from metagcttt_core.agents.agent import Agent, TensorBatch
+from metagcttt_core.agents.agent import Agent
 from metagcttt_core.meta.config import MetaConfig
+from metagcttt_core.meta.experts import Expert
+from metagcttt_core.meta.parallel import mean_over_tasks
 from metagcttt_core.meta.second_order import meta_gradient
-
-
-@dataclass(frozen=True)
-class Expert:
-    """The outcome of one task's inner loop.
-
-    Attributes:
-        result: The adapted copy and its losses.
-        test_batch: What scores the copy.
-        train_batches: Draws the batches of the inner steps once more.
-    """
-
-    result: InnerLoopResult
-    test_batch: TensorBatch
-    train_batches: Callable[[], Iterable[TensorBatch]]
-
 
 MetaUpdate = Callable[[Agent, Sequence[Expert], MetaConfig, torch.optim.Optimizer | None], None]
 
@@ -42,8 +27,8 @@ def continual(
     optimizer: torch.optim.Optimizer | None = None,
 ) -> None:
     """CONTINUAL-TTT: theta <- mean of the adapted weights."""
-    for name, weight in base.state_dict().items():
-        weight.copy_(_mean_weight(experts, name))
+    for weight, mean in zip(base.state_dict().values(), _mean_weights(experts), strict=True):
+        weight.copy_(mean)
 
 
 @torch.no_grad()
@@ -54,8 +39,8 @@ def reptile(
     optimizer: torch.optim.Optimizer | None = None,
 ) -> None:
     """TT-REPTILE: theta <- theta + beta (mean of the adapted weights - theta)."""
-    for name, weight in base.state_dict().items():
-        weight.add_(config.meta_lr * (_mean_weight(experts, name) - weight))
+    for weight, mean in zip(base.state_dict().values(), _mean_weights(experts), strict=True):
+        weight.add_(config.meta_lr * (mean - weight))
 
 
 def fomaml(
@@ -112,20 +97,17 @@ def _step_down_the_mean(
     config: MetaConfig,
     optimizer: torch.optim.Optimizer | None,
 ) -> None:
-    """Step the base with the mean of the experts' gradients."""
+    """Step the base with the mean of the experts' gradients; its target networks follow."""
     if optimizer is None:
         raise ValueError(f'{config.algorithm} needs an outer optimizer')
     parameters = list(base.trained_parameters(actor_only=config.actor_only))
-    means = [torch.zeros_like(parameter) for parameter in parameters]
-    for expert in experts:
-        for mean, part in zip(means, gradient(expert), strict=True):
-            mean += part / len(experts)
+    means = mean_over_tasks(gradient(expert) for expert in experts)
     for parameter, mean in zip(parameters, means, strict=True):
         parameter.grad = mean
+    if not config.actor_only:
+        base.update_targets()
     optimizer.step()
 
 
-def _mean_weight(experts: Sequence[Expert], name: str) -> torch.Tensor:
-    # In float64, so that the mean of equal weights is that weight, to the bit.
-    weights = torch.stack([expert.result.agent.state_dict()[name] for expert in experts])
-    return weights.double().mean(dim=0).to(weights.dtype)
+def _mean_weights(experts: Sequence[Expert]) -> list[torch.Tensor]:
+    return mean_over_tasks(list(expert.result.agent.state_dict().values()) for expert in experts)

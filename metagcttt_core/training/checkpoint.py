@@ -1,5 +1,6 @@
 """Checkpoints: safetensors for the weights, JSON for the rest, never pickle."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 import hashlib
 import json
@@ -107,12 +108,18 @@ def save_checkpoint(agent: Agent, path: str | Path, training: TrainingState | No
             old.unlink()
 
 
-def load_checkpoint(path: str | Path, *, environment: str | None = None) -> Agent:
+def load_checkpoint(
+    path: str | Path,
+    *,
+    environment: str | None = None,
+    changes: Mapping[str, Any] | None = None,
+) -> Agent:
     """The agent saved in the folder `path`.
 
     Args:
         path: The folder, or its `checkpoint.json`.
         environment: Refuse a checkpoint trained for another environment.
+        changes: Settings of the agent to use instead of the saved ones, such as `actor_loss`.
 
     Raises:
         CheckpointError: If there is none, it is damaged, of another version, or does not fit; the
@@ -132,7 +139,7 @@ def load_checkpoint(path: str | Path, *, environment: str | None = None) -> Agen
         )
     agent_type = AGENTS[index.agent]
     try:
-        settings = agent_type.settings_type(**index.settings)
+        settings = agent_type.settings_type(**index.settings | dict(changes or {}))
     except ValidationError as error:
         raise CheckpointError(f'{folder}: settings: {"; ".join(error_lines(error))}') from error
     agent = agent_type(index.obs_dim, index.act_dim, settings, torch.Generator())

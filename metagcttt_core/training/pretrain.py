@@ -11,6 +11,7 @@ from metagcttt_core.agents.agent import Agent
 from metagcttt_core.config.settings import Settings
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.data.relabel import GoalRelabeller
+from metagcttt_core.training.numerics import loss_function, Precision
 from metagcttt_core.training.optimizers import make_optimizer
 from metagcttt_core.training.run import TrainingRun
 from metagcttt_core.training.step import gradient_step
@@ -30,8 +31,10 @@ def pretrain(
     config: PretrainConfig,
     seed: int = 0,
     *,
+    precision: Precision = 'float32',
+    compiled: bool = False,
     run: TrainingRun | None = None,
-    on_step: Callable[[int, dict[str, torch.Tensor]], Any] = lambda step, losses: None,
+    on_step: Callable[[int, dict[str, torch.Tensor], Agent], Any] = lambda *_: None,
 ) -> Agent:
     """Pre-train a copy of `agent`.
 
@@ -40,8 +43,11 @@ def pretrain(
         dataset: The offline dataset D.
         config: Steps, learning rate, batch size.
         seed: Of the batches.
+        precision: Of the matrix products; see `loss_function`.
+        compiled: Compile the loss; see `loss_function`.
         run: Checkpoints and resume.
-        on_step: Told the number of steps done and the losses (detached tensors) after each.
+        on_step: Told the number of steps done, the losses before the last of them (detached
+            tensors) and the agent after it.
 
     Returns:
         The trained copy.
@@ -51,9 +57,12 @@ def pretrain(
     relabeller = GoalRelabeller(dataset, agent.settings.goals, agent.settings.discount)
     parameters = list(agent.trained_parameters())
     optimizer = make_optimizer('adam', parameters, config.lr)
+    losses = loss_function(agent, precision=precision, compiled=compiled)
     for step in range(run.restore(agent, optimizer), config.steps):
         batch = relabeller.sample(config.batch_size, np.random.default_rng((seed, step)))
-        loss, parts = gradient_step(agent, optimizer, parameters, agent.tensors(batch))
-        on_step(step + 1, {'loss': loss, **parts})
+        loss, parts = gradient_step(
+            agent, optimizer, parameters, agent.tensors(batch), losses=losses
+        )
+        on_step(step + 1, {'loss': loss, **parts}, agent)
         run.step_done(agent, optimizer, step + 1, config.steps)
     return agent

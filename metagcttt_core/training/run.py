@@ -38,6 +38,7 @@ class TrainingRun:
         every: int = 1000,
         resume: bool = False,
         should_stop: Callable[[], bool] = lambda: False,
+        writes: bool = True,
     ) -> None:
         """Describe the run.
 
@@ -48,6 +49,7 @@ class TrainingRun:
             every: Steps between checkpoints.
             resume: Go on from the checkpoint in `folder`, if there is one.
             should_stop: Asked after every step; true saves a checkpoint and ends the run.
+            writes: Whether this process saves; of several that do the same, one should.
         """
         self._stage = stage
         self._settings = to_jsonable_python(settings)  # as they come back from a checkpoint
@@ -55,6 +57,7 @@ class TrainingRun:
         self._every = every
         self._resume = resume
         self._should_stop = should_stop
+        self._writes = writes
 
     def restore(self, agent: Agent, optimizer: torch.optim.Optimizer | None) -> int:
         """Load the checkpoint to go on from into `agent` and `optimizer`; returns the steps done.
@@ -100,7 +103,8 @@ class TrainingRun:
             TrainingInterrupted: After saving, when the run was asked to stop.
         """
         stopping = step < last and self._should_stop()
-        if self._folder is not None and (stopping or step == last or step % self._every == 0):
+        due = stopping or step == last or step % self._every == 0
+        if due and self._writes and self._folder is not None:
             state = optimizer.state_dict()['state'] if optimizer is not None else {}
             training = TrainingState(self._stage, step, self._settings, state)
             save_checkpoint(agent, self._folder, training)

@@ -31,6 +31,15 @@ def random_dataset(
     )
 
 
+def maze_walks() -> TrajectoryDataset:
+    """Trajectories that wander through the medium maze's square: every task finds some."""
+    rng = np.random.default_rng(0)
+    steps = rng.normal(0, 0.6, size=(40, 101, 2)).cumsum(axis=1)
+    observations = (steps + rng.uniform(0, 20, size=(40, 1, 2))).reshape(-1, 2)
+    actions = np.clip(rng.normal(size=observations.shape), -1, 1)
+    return TrajectoryDataset.from_arrays(observations, actions, terminals_of([101] * 40))
+
+
 def dataset_at(trajectories: Sequence[Sequence[Any]], act_dim: int = 2) -> TrajectoryDataset:
     """A dataset whose trajectories visit the given states; actions are zero."""
     states = [np.atleast_2d(np.asarray(states, np.float32)) for states in trajectories]

@@ -1,10 +1,12 @@
 """QueryBatches: which transitions and which goals adapt the policy."""
 
 from metagcttt_core import TrajectoryDataset
+from metagcttt_core.adaptation import batches as batches_module
 from metagcttt_core.adaptation.batches import QueryBatches
 import numpy as np
 import pytest
 from tests.core.builders import terminals_of, tiny_agent
+import torch
 
 GOAL = np.array([-7.0])
 
@@ -112,3 +114,21 @@ def test_drawing_changes_neither_dataset_nor_goal(dataset):
     batches.sample(8, np.random.default_rng(0))['actor_goals'][:] = 3
     assert np.array_equal(dataset.observations[:, 0], np.arange(30))
     assert batches.sample(8, np.random.default_rng(0))['actor_goals'][0] == -7
+
+
+@pytest.mark.parametrize('name', ['gcbc', 'gciql'])
+@pytest.mark.parametrize('ratio', [1.0, 0.5])
+@pytest.mark.parametrize('steps_at_once', [1, 3, 64])
+def test_batches_of_many_steps_equal_one_sample_after_another(
+    steps_at_once, ratio, name, dataset, monkeypatch
+):
+    monkeypatch.setattr(batches_module, '_GATHERED_STEPS', steps_at_once)
+    batches = batches_of(dataset, range(20), name, ratio=ratio, fix_actor_goal=0.5)
+    rng = np.random.default_rng(3)
+    one_by_one = [batches.sample(16, rng) for _ in range(7)]
+    together = list(batches.steps(7, 16, np.random.default_rng(3)))
+    assert len(together) == 7
+    for first, second in zip(one_by_one, together, strict=True):
+        assert first.keys() == second.keys()
+        assert all(torch.equal(first[key], second[key]) for key in first)
+    assert list(batches.steps(0, 16, rng)) == []

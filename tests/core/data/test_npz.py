@@ -286,7 +286,9 @@ def test_wrong_arrays_are_refused_with_the_file(tmp_path, members, message, memo
 def test_missing_file_and_folder_are_refused(tmp_path):
     with pytest.raises(DatasetError, match=r'absent\.npz: no such file'):
         TrajectoryDataset.load(tmp_path / 'absent.npz')
-    with pytest.raises(DatasetError, match=rf'{tmp_path}: is a folder, expected an npz file'):
+    with pytest.raises(
+        DatasetError, match=rf'{tmp_path}: no Minari dataset there, expected .*main_data\.hdf5'
+    ):
         TrajectoryDataset.load(tmp_path)
 
 
@@ -310,3 +312,34 @@ def test_save_makes_missing_folders(tmp_path):
     path = tmp_path / 'a' / 'b' / 'data.npz'
     random_dataset().save(path)
     assert TrajectoryDataset.load(path).num_rows == 15
+
+
+@pytest.mark.parametrize(
+    ('obs_dim', 'act_dim', 'nq', 'nv'), [(2, 2, 2, 2), (29, 8, 15, 14), (69, 21, 28, 27)]
+)
+@pytest.mark.parametrize('floats', [np.float16, np.float32])
+@pytest.mark.parametrize('flags', [bool, np.float32, np.uint8])
+def test_files_as_ogbench_publishes_them_load_unchanged(
+    tmp_path, obs_dim, act_dim, nq, nv, floats, flags
+):
+    rng, rows = np.random.default_rng(0), 33
+    terminals = np.arange(rows) % 11 == 10
+    arrays = {
+        name: rng.normal(size=(rows, width)).astype(floats)
+        for name, width in (
+            ('observations', obs_dim),
+            ('actions', act_dim),
+            ('qpos', nq),
+            ('qvel', nv),
+        )
+    }
+    np.savez_compressed(tmp_path / 'maze.npz', **arrays, terminals=terminals.astype(flags))
+    dataset = TrajectoryDataset.load(tmp_path / 'maze.npz')
+    for name in ('observations', 'actions'):
+        array = getattr(dataset, name)
+        assert array.dtype == np.float32
+        np.testing.assert_array_equal(array, arrays[name])
+    for name in ('qpos', 'qvel'):
+        np.testing.assert_array_equal(dataset.extras[name], arrays[name])
+    np.testing.assert_array_equal(dataset.episode_starts, [0, 11, 22])
+    np.testing.assert_array_equal(dataset.episode_ends, [10, 21, 32])

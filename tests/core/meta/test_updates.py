@@ -4,9 +4,9 @@ import copy
 
 from metagcttt_core import MetaConfig
 from metagcttt_core.adaptation.inner_loop import InnerLoopResult
+from metagcttt_core.meta.experts import Expert
 from metagcttt_core.meta.updates import (
     continual,
-    Expert,
     fomaml,
     GRADIENT_UPDATES,
     META_UPDATES,
@@ -184,6 +184,21 @@ def test_fomaml_of_the_actor_alone_leaves_the_critics():
     fomaml(base, [expert_of(adapted, test_batch=held_out_batch(base))], config, optimizer)
     for name, weight in base.state_dict().items():
         assert torch.equal(weight, weights[name]) == (not name.startswith('actor.')), name
+
+
+def test_fomaml_of_the_whole_agent_moves_the_target_critics_like_any_gradient_step():
+    """By tau towards the critics as they were before the outer step."""
+    base = tiny_agent('gciql', actor_loss='bc', tau=0.25)
+    pairs = zip(base.target1.parameters(), base.critic1.parameters(), strict=True)
+    expected = [(0.75 * target + 0.25 * critic).detach() for target, critic in pairs]
+    batch = held_out_batch(base)
+    extra = {'next_observations': batch['observations'], 'value_goals': batch['actor_goals']}
+    extra |= {'rewards': -torch.ones(5), 'masks': torch.ones(5)}
+    expert = expert_of(tiny_agent('gciql', seed=1, actor_loss='bc'), test_batch=batch | extra)
+    optimizer = make_optimizer('adam', base.trained_parameters(), 0.1)
+    fomaml(base, [expert], CONFIG, optimizer)
+    for target, wanted in zip(base.target1.parameters(), expected, strict=True):
+        torch.testing.assert_close(target.detach(), wanted)
 
 
 def test_fomaml_without_an_outer_optimizer_is_refused():

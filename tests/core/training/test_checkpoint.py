@@ -355,3 +355,16 @@ def test_crash_before_the_first_checkpoint_leaves_none(tmp_path, monkeypatch):
     assert not has_checkpoint(tmp_path)
     with pytest.raises(CheckpointError, match='no checkpoint there'):
         load_checkpoint(tmp_path)
+
+
+def test_changed_settings_replace_the_saved_ones(tmp_path):
+    agent = tiny_agent('gciql', actor_loss='ddpgbc')
+    save_checkpoint(agent, tmp_path)
+    changed = load_checkpoint(tmp_path, changes={'actor_loss': 'bc'})
+    assert changed.settings == agent.settings.model_copy(update={'actor_loss': 'bc'})
+    assert_bit_equal(changed, weights_of(agent))
+    with pytest.raises(CheckpointError, match='actor_loss: Input should be'):
+        load_checkpoint(tmp_path, changes={'actor_loss': 'sac'})
+    save_checkpoint(tiny_agent('gcbc'), tmp_path)
+    with pytest.raises(CheckpointError, match="GCBCSettings has no setting 'actor_loss'"):
+        load_checkpoint(tmp_path, changes={'actor_loss': 'bc'})

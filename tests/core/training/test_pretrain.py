@@ -50,7 +50,7 @@ def test_every_step_is_reported_with_its_losses():
         tiny_agent(),
         random_dataset(),
         CONFIG,
-        on_step=lambda step, losses: reports.append((step, losses)),
+        on_step=lambda step, losses, agent: reports.append((step, losses)),
     )
     assert [step for step, _ in reports] == [1, 2, 3, 4, 5]
     for _, losses in reports:
@@ -109,7 +109,7 @@ def test_resuming_after_any_step_gives_the_same_bits(name, tmp_path):
             dataset,
             CONFIG,
             run=run_in(folder, resume=True),
-            on_step=lambda step, losses, steps=steps: steps.append(step),
+            on_step=lambda step, losses, agent, steps=steps: steps.append(step),
         )
         assert steps == list(range(interrupted_at + 1, 6))
         assert_bit_equal(resumed, expected)

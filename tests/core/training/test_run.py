@@ -127,3 +127,23 @@ def test_resume_refuses_an_agent_of_another_shape_by_name(tmp_path):
     TrainingRun('pretrain', {}, tmp_path).step_done(small, None, 1, 1)
     with pytest.raises(CheckpointError, match='cannot resume, settings of the agent was'):
         TrainingRun('pretrain', {}, tmp_path, resume=True).restore(large, None)
+
+
+def test_process_that_does_not_write_restores_and_stops_all_the_same(tmp_path):
+    agent, optimizer = trained()
+    TrainingRun('pretrain', SETTINGS, tmp_path, every=5).step_done(agent, optimizer, 5, 10)
+    other = tiny_agent(seed=8)
+    run = TrainingRun(
+        'pretrain',
+        SETTINGS,
+        tmp_path,
+        every=1,
+        resume=True,
+        should_stop=lambda: True,
+        writes=False,
+    )
+    assert run.restore(other, None) == 5
+    assert_bit_equal(other, weights_of(agent))
+    with pytest.raises(TrainingInterrupted, match='stopped after step 6 of 10'):
+        run.step_done(other, None, 6, 10)
+    assert load_training_state(tmp_path).step == 5

@@ -1,0 +1,59 @@
+"""How losses are computed: number formats and compilation. Weights and optimiser stay float32."""
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from metagcttt_core.agents.agent import Agent, TensorBatch
+
+Precision = Literal['float32', 'bfloat16', 'auto']
+LossFunction = Callable[[TensorBatch], tuple[Tensor, dict[str, Tensor]]]
+
+
+# torch's own tanh dominates GELU on a processor; written with exp it costs a quarter.
+def _compile_options(device: torch.device) -> dict[str, Any] | None:
+    if device.type != 'cpu':
+        return None
+    return {
+        'cpp.use_decompose_tanh': True,
+        'cpp.enable_floating_point_contract_flag': 'fast',
+        'cpp.threads': torch.get_num_threads(),
+    }
+
+
+def resolve_precision(
+    precision: Precision, device: torch.device
+) -> Literal['float32', 'bfloat16']:
+    """`float32` or `bfloat16`; `auto` is bfloat16 where the device has matrix units for it."""
+    if precision != 'auto':
+        return precision
+    if device.type == 'cuda':
+        return 'bfloat16' if torch.cuda.is_bf16_supported(including_emulation=False) else 'float32'
+    return 'bfloat16' if torch.cpu.get_capabilities().get('amx_bf16') else 'float32'
+
+
+def loss_function(
+    agent: Agent, *, precision: Precision = 'float32', compiled: bool = False
+) -> LossFunction:
+    """The agent's loss of a batch, computed in the given way.
+
+    Args:
+        agent: Whose `losses`, with the weights it has at each call.
+        precision: Of the matrix products: `bfloat16` runs them under autocast, which keeps sums
+            and losses in float32.
+        compiled: Fuse the steps between matrix products with `torch.compile`, which takes up to
+            half a minute before the first loss and a C++ compiler on a processor.
+    """
+    losses = agent.losses
+    if compiled:
+        losses = torch.compile(losses, options=_compile_options(agent.device))
+    if resolve_precision(precision, agent.device) == 'float32':
+        return losses
+
+    def in_bfloat16(batch: TensorBatch) -> tuple[Tensor, dict[str, Tensor]]:
+        with torch.autocast(agent.device.type, torch.bfloat16):
+            return losses(batch)
+
+    return in_bfloat16

@@ -1,0 +1,160 @@
+"""Minari datasets: written by Minari's own API, read as rows; and what is refused."""
+
+import sys
+
+from gymnasium import spaces
+import h5py
+from metagcttt_core import DatasetError, TrajectoryDataset
+import minari
+from minari.data_collector import EpisodeBuffer
+import numpy as np
+import pytest
+
+pytestmark = [
+    pytest.mark.filterwarnings('ignore:.* is set to None'),
+    pytest.mark.filterwarnings('ignore:env_spec is None'),
+]
+LENGTHS = [4, 2, 11, 3, 5, 6, 7, 8, 9, 2, 3, 4]  # 12 episodes: '10' sorts before '2' as text
+
+
+def episode(number, steps, *, robot):
+    rng = np.random.default_rng(number)
+    position = rng.normal(size=(steps + 1, 2))
+    rest = rng.normal(size=(steps + 1, 2 if robot == 'point' else 27))
+    observation = np.concatenate([position, rest], axis=1) if robot == 'point' else rest
+    return EpisodeBuffer(
+        id=number,
+        observations={
+            'observation': observation,
+            'achieved_goal': position,
+            'desired_goal': rng.normal(size=(steps + 1, 2)),
+        },
+        actions=rng.uniform(-1, 1, (steps, 2)).astype(np.float32),
+        rewards=[0.0] * steps,
+        terminations=[False] * steps,
+        truncations=[False] * (steps - 1) + [True],
+        infos={'qpos': position} if robot == 'point' else {},
+    )
+
+
+@pytest.fixture(params=['point', 'ant'])
+def made(request, tmp_path, monkeypatch):
+    """The episodes and the folder of a dataset that Minari wrote."""
+    monkeypatch.setenv('MINARI_DATASETS_PATH', str(tmp_path))
+    episodes = [episode(k, steps, robot=request.param) for k, steps in enumerate(LENGTHS)]
+    box = {name: spaces.Box(-np.inf, np.inf, value.shape[1:], np.float64) for name, value in
+           episodes[0].observations.items()}  # fmt: skip
+    minari.create_dataset_from_buffers(
+        'maze/walks-v0',
+        episodes,
+        observation_space=spaces.Dict(box),
+        action_space=spaces.Box(-1, 1, (2,)),
+        algorithm_name='random',
+        author='nobody',
+        author_email='nobody@example.org',
+        code_permalink='https://example.org',
+    )
+    return episodes, tmp_path / 'maze' / 'walks-v0'
+
+
+def test_rows_are_the_episodes_back_to_back(made):
+    episodes, folder = made
+    dataset = TrajectoryDataset.load(folder)
+    assert dataset.num_episodes == len(LENGTHS)
+    assert (dataset.observations.dtype, dataset.source) == (np.float32, folder)
+    for first, last, expected in zip(
+        dataset.episode_starts, dataset.episode_ends, episodes, strict=True
+    ):
+        observations = expected.observations
+        rows = (
+            observations['observation']
+            if dataset.obs_dim == 4
+            else np.hstack([observations['achieved_goal'], observations['observation']])
+        )
+        np.testing.assert_allclose(dataset.observations[first : last + 1], rows, rtol=1e-6)
+        np.testing.assert_array_equal(dataset.actions[first:last], expected.actions)
+        np.testing.assert_array_equal(dataset.actions[last], 0)
+    assert dataset.obs_dim in (4, 29)
+    assert set(dataset.extras) == ({'qpos'} if dataset.obs_dim == 4 else set())
+
+
+def test_file_data_folder_and_dataset_folder_are_the_same_dataset(made):
+    _, folder = made
+    paths = (folder, folder / 'data', folder / 'data' / 'main_data.hdf5')
+    first, *others = [TrajectoryDataset.load(path) for path in paths]
+    for other in others:
+        np.testing.assert_array_equal(first.observations, other.observations)
+        np.testing.assert_array_equal(first.terminals, other.terminals)
+
+
+def test_imported_dataset_can_be_saved_as_npz(made, tmp_path):
+    dataset = TrajectoryDataset.load(made[1])
+    dataset.save(tmp_path / 'walks.npz')
+    again = TrajectoryDataset.load(tmp_path / 'walks.npz')
+    np.testing.assert_array_equal(dataset.observations, again.observations)
+    np.testing.assert_array_equal(dataset.episode_ends, again.episode_ends)
+
+
+def write(path, **episodes):
+    with h5py.File(path, 'w') as file:
+        for name, fields in episodes.items():
+            for field, values in fields.items():
+                file[f'{name}/{field}'] = values
+    return path
+
+
+def test_plain_arrays_are_taken_as_they_are(tmp_path):
+    states = np.arange(12.0).reshape(4, 3)
+    path = write(
+        tmp_path / 'a.hdf5', episode_0={'observations': states, 'actions': np.ones((3, 1))}
+    )
+    dataset = TrajectoryDataset.load(path)
+    np.testing.assert_array_equal(dataset.observations, states)
+    np.testing.assert_array_equal(dataset.actions[:, 0], [1, 1, 1, 0])
+    np.testing.assert_array_equal(dataset.terminals, [False, False, False, True])
+
+
+GOOD = {'observations': np.zeros((4, 3)), 'actions': np.zeros((3, 1))}
+
+
+@pytest.mark.parametrize(
+    ('episodes', 'message'),
+    [
+        ({}, 'holds no episodes'),
+        ({'episode_0': {'observations': np.zeros((4, 3))}}, 'episode_0 has no actions'),
+        (
+            {'episode_0': {**GOOD, 'actions': np.zeros((4, 1))}},
+            'episode_0 has 4 actions but 4 observations, expected 5',
+        ),
+        (
+            {'episode_0': GOOD, 'episode_1': {**GOOD, 'observations': np.zeros((4, 2))}},
+            r"episode 1 has fields .*'observations': \(2,\).* the first one has",
+        ),
+        ({'episode_0': {**GOOD, 'actions': [b'x', b'y', b'z']}}, 'actions must be numbers'),
+        ({'episode_0': {**GOOD, 'actions': np.zeros(3)}}, r'got float64 of shape \(3,\)'),
+        (
+            {'episode_0': {'observations/observation': np.zeros((4, 3)), 'actions': [[0]] * 3}},
+            'must hold observation and achieved_goal, found: observation',
+        ),
+        ({'episode_0': {**GOOD, 'observations': np.full((4, 3), np.nan)}}, 'nan in row 0'),
+    ],
+)
+def test_wrong_content_is_refused(tmp_path, episodes, message):
+    with pytest.raises(DatasetError, match=message):
+        TrajectoryDataset.load(write(tmp_path / 'bad.hdf5', **episodes))
+
+
+def test_truncated_and_missing_files_are_refused(tmp_path):
+    path = write(tmp_path / 'cut.hdf5', episode_0=GOOD)
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(DatasetError, match=r'cut\.hdf5: not a complete HDF5 file'):
+        TrajectoryDataset.load(path)
+    with pytest.raises(DatasetError, match=r'absent\.hdf5: no such file'):
+        TrajectoryDataset.load(tmp_path / 'absent.hdf5')
+
+
+def test_without_h5py_the_message_says_what_to_install(tmp_path, monkeypatch):
+    write(tmp_path / 'a.hdf5', episode_0=GOOD)
+    monkeypatch.setitem(sys.modules, 'h5py', None)
+    with pytest.raises(DatasetError, match=r'pip install -c constraints\.txt h5py'):
+        TrajectoryDataset.load(tmp_path / 'a.hdf5')
