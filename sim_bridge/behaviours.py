@@ -6,12 +6,13 @@ from typing import Literal
 import numpy as np
 
 from sim_bridge.maze_map import Cell, MazeMap
-from sim_bridge.ogbench_layouts import NOISE_M
 from sim_bridge.simulator import Array, Simulator
 
 Kind = Literal['navigate', 'stitch', 'explore']
 
 STITCH_CELLS = 4
+NOISE = 0.25
+"""Starts and goals lie uniformly within this share of a cell of its center, in x and in y."""
 EXPLORE_STEPS = 10
 
 
@@ -52,7 +53,8 @@ class Behaviour(ABC):
     def near_center(self, cell: Cell) -> tuple[float, float]:
         """Draw a point around the center of a cell."""
         x, y = self.maze.center(*cell)
-        dx, dy = self.rng.uniform(-NOISE_M, NOISE_M, size=2)
+        reach_m = NOISE * self.maze.unit_m
+        dx, dy = self.rng.uniform(-reach_m, reach_m, size=2)
         return x + dx, y + dy
 
 

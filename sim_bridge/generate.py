@@ -18,9 +18,10 @@ from sim_bridge.chunks import (
     plan_chunks,
     refuse_difference,
 )
-from sim_bridge.controllers import make_direction_follower
+from sim_bridge.controllers import DirectionFollower, LearnedFollower, make_direction_follower
 from sim_bridge.files import write_json
 from sim_bridge.plan import GenerationPlan
+from sim_bridge.posture import count_falls
 from sim_bridge.registry import describe_environment
 from sim_bridge.workers import record_chunks
 
@@ -67,12 +68,14 @@ class DatasetStatistics:
         validation_rows: Rows of the validation file.
         goals_per_episode: Mean number of goals reached in an episode.
         coverage: Share of the free cells of the maze that were visited, 0 to 1.
+        falls_per_episode: Mean number of falls in an episode; 0 for a robot that cannot fall.
     """
 
     rows: int
     validation_rows: int
     goals_per_episode: float
     coverage: float
+    falls_per_episode: float = 0.0
 
 
 def generate(
@@ -82,11 +85,12 @@ def generate(
     resume: bool = False,
     overwrite: bool = False,
     progress: Progress | None = None,
+    controller: Path | None = None,
 ) -> DatasetStatistics:
     """Generate a dataset in OGBench's format and return what it holds.
 
     Writes `NAME.npz`, `NAME-val.npz` and, last, `NAME.json` (settings, versions, statistics).
-    The files depend on the plan (and the physics packages) alone, not on `processes`.
+    The files depend on the plan, the controller and the physics packages, not on `processes`.
     An interruption loses at most the chunks being recorded; `resume` goes on with the others.
 
     Args:
@@ -97,6 +101,8 @@ def generate(
             is left as it is.
         overwrite: Discard what an earlier call left.
         progress: Told how many episodes are done.
+        controller: Folder of the learned controller to use, for a robot that needs one; by
+            default the one that comes with the package.
 
     Returns:
         Statistics of the dataset.
@@ -108,10 +114,10 @@ def generate(
     """
     if processes < 1:
         raise GenerationError(f'processes must be at least 1, got {processes}')
-    make_direction_follower(describe_environment(plan.environment).spec)
+    follower = make_direction_follower(describe_environment(plan.environment).spec, controller)
     paths = OutputPaths(output)
     folder = ChunkFolder(paths.partial)
-    settings = _settings(plan)
+    settings = _settings(plan, follower)
     if overwrite:
         folder.remove()
         paths.sidecar.unlink(missing_ok=True)
@@ -128,7 +134,7 @@ def generate(
     done = total - sum(chunk.stop - chunk.start for chunk in missing)
     if progress:
         progress(done, total)
-    for chunk in record_chunks(plan, missing, folder, processes):
+    for chunk in record_chunks(plan, missing, folder, processes, controller):
         done += chunk.stop - chunk.start
         if progress:
             progress(done, total)
@@ -138,10 +144,13 @@ def generate(
     return statistics
 
 
-def _settings(plan: GenerationPlan) -> dict[str, Any]:
+def _settings(plan: GenerationPlan, follower: DirectionFollower) -> dict[str, Any]:
     """Everything that decides the content of a dataset."""
+    controller = (
+        {'controller_sha256': follower.sha256} if isinstance(follower, LearnedFollower) else {}
+    )
     versions = {f'{package}_version': version(package) for package in PHYSICS_PACKAGES}
-    return {'format_version': FORMAT_VERSION, **plan.model_dump(), **versions}
+    return {'format_version': FORMAT_VERSION, **plan.model_dump(), **controller, **versions}
 
 
 def _refuse_existing(paths: OutputPaths) -> None:
@@ -187,6 +196,15 @@ def _assemble(
         validation_rows=validation_set.num_rows,
         goals_per_episode=float(np.concatenate([part['goals_reached'] for part in train]).mean()),
         coverage=float((visited & free).sum() / free.sum()),
+        falls_per_episode=_falls(train, plan.rows_per_episode) / plan.episodes,
+    )
+
+
+def _falls(parts: list[dict[str, np.ndarray]], rows_per_episode: int) -> int:
+    return sum(
+        count_falls(part['qpos'][start : start + rows_per_episode])
+        for part in parts
+        for start in range(0, len(part['qpos']), rows_per_episode)
     )
 
 

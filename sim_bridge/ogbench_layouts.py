@@ -8,8 +8,6 @@ from dataclasses import dataclass
 
 UNIT_M = 4.0
 ORIGIN_XY = (-4.0, -4.0)
-NOISE_M = 1.0
-"""Starts and goals lie uniformly within this distance of a cell center, in x and in y."""
 
 LAYOUTS: dict[str, tuple[str, ...]] = {
     'medium': (

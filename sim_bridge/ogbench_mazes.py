@@ -9,8 +9,8 @@ import re
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
+from sim_bridge.gym_maze import check_seed, GymMaze
 from sim_bridge.maze_map import MazeMap
 from sim_bridge.ogbench_layouts import (
     LAYOUTS,
@@ -19,16 +19,8 @@ from sim_bridge.ogbench_layouts import (
     TASK_CELLS,
     UNIT_M,
 )
-from sim_bridge.rendering import choose_opengl_library, rendering_help
-from sim_bridge.simulator import (
-    Array,
-    MazeDescription,
-    Simulator,
-    SimulatorError,
-    SimulatorSpec,
-    StepResult,
-    Task,
-)
+from sim_bridge.rendering import choose_opengl_library
+from sim_bridge.simulator import Array, MazeDescription, SimulatorSpec, Task
 
 _DATASET_NAME = re.compile(r'(?P<maze>\w+-\w+)-(navigate|stitch|explore)-v0')
 
@@ -79,7 +71,7 @@ def describe(name: str) -> MazeDescription:
     return MazeDescription(spec=spec, maze=maze, tasks=tasks)
 
 
-class OGBenchMaze(Simulator):
+class OGBenchMaze(GymMaze):
     """One OGBench maze, stepped through the package's own gymnasium environment.
 
     `reset(task_id, seed)` gives what OGBench's environment gives after seeding all three random
@@ -95,36 +87,27 @@ class OGBenchMaze(Simulator):
 
     def __init__(self, name: str) -> None:
         """Load the physics of one of the `names`."""
-        description = describe(name)
-        self.spec = description.spec
-        self.maze = description.maze
-        self.tasks = description.tasks
+        super().__init__(describe(name))
         self._env = _make_environment(name)
         teleports = self._env._teleport_info or {'teleport_in_xys': []}
         self._teleport_xys = teleports['teleport_in_xys']
         self._noise = np.random.RandomState(0)
         self._env.action_space.seed(0)
         self._first_seed: int | None = 0
-        self._running = False
-        self._is_task = False
-        self._has_goal = False
-        self._num_steps = 0
-        self._why_not_running = 'it was never reset'
 
     def reset(self, task_id: int | None = None, seed: int | None = None) -> tuple[Array, Array]:
         """Start an episode of a task; see `Simulator.reset`."""
         options = {} if task_id is None else {'task_id': self._checked_task(task_id)}
         self._show_goal(True)
         observation, goal = self._reset(seed, options)
-        self._is_task = self._has_goal = True
+        self._begin(is_task=True)
         return observation, goal
 
     def reset_free(
         self, seed: int | None = None, start_xy: tuple[float, float] | None = None
     ) -> Array:
         """Start an episode that never ends; see `Simulator.reset_free`."""
-        if start_xy is not None and not self.maze.is_free(*start_xy):
-            raise ValueError(f'start_xy {tuple(start_xy)} is not in a free cell of the maze')
+        self._check_start(start_xy)
         self._seed(seed)
         if start_xy is None:
             free_cells = self.maze.free_cells()
@@ -135,74 +118,11 @@ class OGBenchMaze(Simulator):
         task_info = {'init_ij': cell, 'goal_ij': cell}
         self._show_goal(False)
         observation, _ = self._reset(None, {'task_info': task_info})
-        self._is_task = self._has_goal = False
+        self._begin(is_task=False)
         if start_xy is not None:
             self._env.set_xy(np.array(start_xy, dtype=np.float64))
             observation = self._env.get_ob()
         return observation
-
-    def step(self, action: ArrayLike) -> StepResult:
-        """Apply an action for one control period; see `Simulator.step`."""
-        if not self._running:
-            raise SimulatorError(f'no episode is running ({self._why_not_running}): call reset')
-        values = self._checked_action(action)
-        bounded = values.clip(-1.0, 1.0)
-        with self._own_noise() if self._is_near_teleport() else nullcontext():
-            observation, _, reached, _, _ = self._env.step(bounded)
-        self._num_steps += 1
-        success = self._has_goal and bool(reached)
-        terminated = self._is_task and success
-        truncated = self._is_task and self._num_steps >= self.spec.max_episode_steps
-        if terminated or truncated:
-            self._running = False
-            ending = 'the goal was reached' if terminated else 'the step limit was reached'
-            self._why_not_running = f'{ending} at step {self._num_steps}'
-        clipped = bool((values != bounded).any())
-        return StepResult(observation, terminated, truncated, success, clipped)
-
-    def set_goal(self, goal: ArrayLike) -> None:
-        """Move the goal of the running episode; see `Simulator.set_goal`."""
-        values = np.asarray(goal, dtype=np.float64)
-        if values.shape not in ((2,), (self.spec.obs_dim,)):
-            raise ValueError(
-                f'goal must have shape (2,) or ({self.spec.obs_dim},), got {values.shape}'
-            )
-        if not np.isfinite(values).all():
-            raise ValueError(f'goal must be finite, got {values.tolist()}')
-        if not self._running:
-            raise SimulatorError(f'no episode is running ({self._why_not_running}): call reset')
-        xy = values if values.shape == (2,) else values[list(self.spec.position_dims)]
-        if not self.maze.contains(xy[0], xy[1]):
-            raise ValueError(f'goal {xy.tolist()} lies outside the maze {self.maze.extent}')
-        self._env.set_goal(goal_xy=xy.copy())
-        self._show_goal(True)
-        self._has_goal = True
-
-    @property
-    def position(self) -> tuple[float, float]:
-        """Where the robot is now, (x, y) in metres."""
-        x, y = self._env.get_xy()
-        return float(x), float(y)
-
-    @property
-    def qpos(self) -> Array:
-        """Generalised positions of the physics, a copy."""
-        return np.array(self._env.data.qpos)
-
-    @property
-    def qvel(self) -> Array:
-        """Generalised velocities of the physics, a copy."""
-        return np.array(self._env.data.qvel)
-
-    def render(self) -> NDArray[np.uint8]:
-        """Picture of the maze from above; see `Simulator.render`."""
-        import mujoco
-
-        try:
-            return np.asarray(self._env.render())
-        except (mujoco.FatalError, ImportError, RuntimeError, AttributeError) as error:
-            # One of these, depending on which OpenGL library is missing and how.
-            raise SimulatorError(f'{rendering_help()} ({error})') from error
 
     def close(self) -> None:
         """Free the physics and the renderer."""
@@ -210,16 +130,22 @@ class OGBenchMaze(Simulator):
             self._env.custom_renderer.close()
             self._env.custom_renderer = None
         self._env.close()
-        self._running = False
-        self._why_not_running = 'the simulator is closed'
+        self._end('the simulator is closed')
+
+    def _advance(self, action: Array) -> tuple[Array, bool]:
+        with self._own_noise() if self._is_near_teleport() else nullcontext():
+            observation, _, reached, _, _ = self._env.step(action)
+        return observation, bool(reached)
+
+    def _move_goal(self, xy: Array) -> None:
+        self._env.set_goal(goal_xy=xy)
+        self._show_goal(True)
 
     def _reset(self, seed: int | None, options: dict[str, Any]) -> tuple[Array, Array]:
         self._seed(seed)
         first_seed, self._first_seed = self._first_seed, None
         with self._own_noise():
             observation, info = self._env.reset(seed=first_seed, options=options)
-        self._running = True
-        self._num_steps = 0
         return observation, np.array(info['goal'], dtype=np.float64)
 
     def _show_goal(self, shown: bool) -> None:
@@ -229,8 +155,7 @@ class OGBenchMaze(Simulator):
     def _seed(self, seed: int | None) -> None:
         if seed is None:
             return
-        if not 0 <= seed < 2**32:
-            raise ValueError(f'seed must be from 0 to {2**32 - 1}, got {seed}')
+        check_seed(seed)
         self._noise.seed(seed)
         self._env.action_space.seed(seed)
         self._first_seed = seed
@@ -249,20 +174,6 @@ class OGBenchMaze(Simulator):
     def _is_near_teleport(self) -> bool:
         """Whether the next step might end in a teleport, whose exit is drawn at random."""
         return any(math.dist(self.position, xy) <= _TELEPORT_REACH_M for xy in self._teleport_xys)
-
-    def _checked_task(self, task_id: int) -> int:
-        is_number = isinstance(task_id, int | np.integer) and not isinstance(task_id, bool)
-        if not is_number or not 1 <= task_id <= self.spec.num_tasks:
-            raise ValueError(f'task_id must be from 1 to {self.spec.num_tasks}, got {task_id!r}')
-        return int(task_id)
-
-    def _checked_action(self, action: ArrayLike) -> Array:
-        values = np.asarray(action, dtype=np.float64)
-        if values.shape != (self.spec.act_dim,):
-            raise ValueError(f'action must have shape ({self.spec.act_dim},), got {values.shape}')
-        if not np.isfinite(values).all():
-            raise ValueError(f'action must be finite, got {values.tolist()}')
-        return values
 
 
 def _make_environment(name: str) -> Any:

@@ -47,6 +47,8 @@ def plan_dataset(
 ) -> GenerationPlan:
     """Plan a dataset, with OGBench's size and noise where nothing else is asked for.
 
+    The mazes of gymnasium-robotics, which OGBench has no data of, get those of its point maze.
+
     Raises:
         ValueError: If the environment is unknown.
         pydantic.ValidationError: If a number is out of range.
@@ -57,7 +59,7 @@ def plan_dataset(
         (5000, 201, 0.5)
     """
     name = describe_environment(environment).spec.name
-    usual = _ogbench_size(name, kind)
+    usual = _ogbench_size(name if '_' not in name else 'pointmaze-medium-v0', kind)
     asked = {'episodes': episodes, 'rows_per_episode': rows_per_episode, 'noise': noise}
     given = {key: value for key, value in asked.items() if value is not None}
     return GenerationPlan(environment=name, kind=kind, seed=seed, **{**usual, **given})

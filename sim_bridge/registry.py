@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from difflib import get_close_matches
 
-from sim_bridge import ogbench_mazes
+from sim_bridge import ogbench_mazes, robotics_mazes
 from sim_bridge.maze_map import MazeMap
 from sim_bridge.simulator import MazeDescription, Simulator
 
@@ -32,6 +32,12 @@ FAMILIES: tuple[Family, ...] = (
         ogbench_mazes.canonical_name,
         ogbench_mazes.describe,
         ogbench_mazes.OGBenchMaze,
+    ),
+    Family(
+        robotics_mazes.names,
+        robotics_mazes.canonical_name,
+        robotics_mazes.describe,
+        robotics_mazes.RoboticsMaze,
     ),
 )
 

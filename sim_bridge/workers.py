@@ -7,6 +7,7 @@ from functools import cache
 import multiprocessing
 import multiprocessing.connection
 import os
+from pathlib import Path
 import signal
 import threading
 
@@ -19,16 +20,22 @@ from sim_bridge.simulator import Simulator
 
 
 def record_chunks(
-    plan: GenerationPlan, chunks: list[Chunk], folder: ChunkFolder, processes: int
+    plan: GenerationPlan,
+    chunks: list[Chunk],
+    folder: ChunkFolder,
+    processes: int,
+    controller: Path | None = None,
 ) -> Iterator[Chunk]:
     """Record chunks into the folder and yield each when it is on disk, in any order.
+
+    `controller` is as in `make_direction_follower`.
 
     Raises:
         GenerationError: If a worker process died.
     """
     if processes == 1 or len(chunks) < 2:
         for chunk in chunks:
-            yield _record(plan, chunk, folder)
+            yield _record(plan, chunk, folder, controller)
         return
     executor = ProcessPoolExecutor(
         max_workers=min(processes, len(chunks)),
@@ -36,7 +43,7 @@ def record_chunks(
         initializer=_prepare_worker,
     )
     try:
-        futures = [executor.submit(_record, plan, chunk, folder) for chunk in chunks]
+        futures = [executor.submit(_record, plan, chunk, folder, controller) for chunk in chunks]
         for future in as_completed(futures):
             yield future.result()
     except BrokenProcessPool as error:
@@ -47,8 +54,10 @@ def record_chunks(
         executor.shutdown(cancel_futures=True)
 
 
-def _record(plan: GenerationPlan, chunk: Chunk, folder: ChunkFolder) -> Chunk:
-    simulator, follower = _workbench(plan.environment)
+def _record(
+    plan: GenerationPlan, chunk: Chunk, folder: ChunkFolder, controller: Path | None
+) -> Chunk:
+    simulator, follower = _workbench(plan.environment, controller)
     episodes = [
         record_episode(
             simulator,
@@ -65,10 +74,10 @@ def _record(plan: GenerationPlan, chunk: Chunk, folder: ChunkFolder) -> Chunk:
 
 
 @cache
-def _workbench(environment: str) -> tuple[Simulator, DirectionFollower]:
+def _workbench(environment: str, controller: Path | None) -> tuple[Simulator, DirectionFollower]:
     """Build simulator and controller once per process."""
     simulator = make_simulator(environment)
-    return simulator, make_direction_follower(simulator.spec)
+    return simulator, make_direction_follower(simulator.spec, controller)
 
 
 def _prepare_worker() -> None:

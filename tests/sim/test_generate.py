@@ -235,8 +235,8 @@ def test_bad_requests_are_refused_before_anything_is_written(tmp_path: Path) -> 
         generate(small(), tmp_path / 'maze.zip')
     with pytest.raises(GenerationError, match='processes must be at least 1, got 0'):
         generate(small(), tmp_path / 'maze.npz', processes=0)
-    with pytest.raises(ControllerError, match='antmaze-medium-v0'):
-        generate(plan_dataset('antmaze-medium-v0', 'navigate'), tmp_path / 'maze.npz')
+    with pytest.raises(ControllerError, match='humanoidmaze-medium-v0'):
+        generate(plan_dataset('humanoidmaze-medium-v0', 'navigate'), tmp_path / 'maze.npz')
     assert contents(tmp_path) == {}
 
 
@@ -313,7 +313,10 @@ def test_end_in_the_middle_leaves_no_worker_and_resume_gives_the_same_files(
     children, errors = signal_in_the_middle(output, number)
     wait_until(lambda: not any(is_running(pid) for pid in children), timeout_s=20)
     assert not output.exists()
-    assert errors.count('Traceback') == (1 if number == signal.SIGINT else 0)  # workers are silent
+    # Workers are silent. (glfw, while imported, asks for its version in a script of its own.)
+    tracebacks = errors.split('Traceback (most recent call last)')[1:]
+    ours = [text for text in tracebacks if 'File "<string>"' not in text]
+    assert len(ours) == (1 if number == signal.SIGINT else 0), errors
 
     asked = plan_dataset(MAZE, 'navigate', episodes=EPISODES, rows_per_episode=21)
     done: list[int] = []

@@ -6,13 +6,14 @@ import gymnasium
 import numpy as np
 import ogbench.locomaze  # registers the environments  # noqa: F401
 import pytest
-from sim_bridge import describe_environment, environment_names
-from sim_bridge.ogbench_layouts import NOISE_M
+from sim_bridge import describe_environment
+from sim_bridge.behaviours import NOISE
+from sim_bridge.ogbench_mazes import names
 
 pytestmark = pytest.mark.mujoco
 
 
-@pytest.fixture(scope='module', params=environment_names())
+@pytest.fixture(scope='module', params=names())
 def pair(request: pytest.FixtureRequest) -> tuple[Any, Any]:
     return describe_environment(request.param), gymnasium.make(request.param)
 
@@ -29,7 +30,7 @@ def test_spec_is_the_environments(pair: tuple[Any, Any]) -> None:
     assert spec.control_period_s == pytest.approx(inner.dt)
     assert spec.goal_tolerance_m == inner._goal_tol
     assert spec.num_tasks == inner.num_tasks
-    assert NOISE_M == inner._noise * inner._maze_unit / 4
+    assert NOISE == inner._noise / 4
 
 
 def test_plan_is_the_environments(pair: tuple[Any, Any]) -> None:
@@ -54,7 +55,7 @@ def test_tasks_are_the_environments(pair: tuple[Any, Any]) -> None:
 
 
 def test_maze_left_out_is_one_that_the_package_cannot_build() -> None:
-    assert 'humanoidmaze-teleport-v0' not in environment_names()
+    assert 'humanoidmaze-teleport-v0' not in names()
     with pytest.raises(ValueError, match="material 'teleport_in' not found"):
         gymnasium.make('humanoidmaze-teleport-v0')
 

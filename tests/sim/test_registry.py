@@ -6,14 +6,26 @@ import sys
 import pytest
 from sim_bridge import describe_environment, environment_names, make_simulator, maze_map
 
+DIVERSE = ('_Diverse_G', '_Diverse_GR')
+
 
 def test_every_maze_that_the_package_can_build_is_there() -> None:
-    assert set(environment_names()) == {
+    ogbench = {
         f'{robot}maze-{size}-v0'
         for robot in ('point', 'ant', 'humanoid')
         for size in ('medium', 'large', 'giant', 'teleport')
         if (robot, size) != ('humanoid', 'teleport')
     }
+    robotics = {
+        f'{robot}_{size}-{version}'
+        for robot, versions in (('PointMaze', ['v3']), ('AntMaze', ['v3', 'v4', 'v5']))
+        for version in versions
+        for size in (
+            'UMaze',
+            *(f'{s}{d}' for s in ('Open', 'Medium', 'Large') for d in ('', *DIVERSE)),
+        )
+    }
+    assert set(environment_names()) == ogbench | robotics
 
 
 @pytest.mark.parametrize('kind', ['navigate', 'stitch', 'explore'])
@@ -28,6 +40,7 @@ def test_dataset_name_stands_for_its_maze(kind: str) -> None:
     [
         ('pointmaze-mediun-v0', 'pointmaze-medium-v0'),
         ('antmaze-large', 'antmaze-large-v0'),
+        ('PointMaze_medium-v3', 'PointMaze_Medium-v3'),
         ('pointmaze-medium-play-v0', 'pointmaze-medium-v0'),
         ('', 'pointmaze'),
     ],

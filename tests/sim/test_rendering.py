@@ -67,9 +67,13 @@ def test_nothing_is_chosen_once_mujoco_has_chosen(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.mujoco
-def test_picture_shows_the_walls_and_the_robot_moving() -> None:
-    with make_simulator('pointmaze-medium-v0') as simulator:
-        simulator.reset_free(seed=0, start_xy=(0.0, 0.0))
+@pytest.mark.parametrize(
+    'name', ['pointmaze-medium-v0', 'PointMaze_Medium-v3', 'AntMaze_Medium_Diverse_G-v5']
+)
+def test_picture_shows_the_walls_and_the_robot_moving(name: str) -> None:
+    with make_simulator(name) as simulator:
+        start, goal = simulator.tasks[1].start_xy, simulator.tasks[1].goal_xy
+        simulator.reset_free(seed=0, start_xy=start)
         try:
             first = simulator.render()
         except SimulatorError as error:
@@ -77,7 +81,7 @@ def test_picture_shows_the_walls_and_the_robot_moving() -> None:
         assert first.shape == (200, 200, 3)
         assert first.dtype == np.uint8
         assert first.std() > 10
-        simulator.reset_free(seed=0, start_xy=(20.0, 20.0))
+        simulator.reset_free(seed=0, start_xy=goal)
         assert (simulator.render() != first).any()
 
 

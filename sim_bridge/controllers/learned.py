@@ -1,0 +1,148 @@
+"""Learned direction followers: a small network in NumPy, kept as safetensors and JSON."""
+
+from dataclasses import dataclass, field
+import hashlib
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from safetensors import SafetensorError
+import safetensors.numpy
+
+from sim_bridge.controllers.follower import ControllerError
+from sim_bridge.files import atomic_file, write_json
+from sim_bridge.simulator import Array
+
+_INDEX = 'controller.json'
+
+
+class _Index(BaseModel):
+    model_config = ConfigDict(frozen=True, extra='forbid')
+
+    format: Literal['metagcttt-direction-follower'] = 'metagcttt-direction-follower'
+    version: Literal[1] = 1
+    robot: str
+    layers: int = Field(ge=1)
+    sha256: str = Field(pattern=r'^[0-9a-f]{64}$')
+    metadata: dict[str, Any]
+
+    @property
+    def weights(self) -> str:
+        """Name of the file beside this one that holds the weights."""
+        return f'weights-{self.sha256[:16]}.safetensors'
+
+
+@dataclass(frozen=True)
+class LearnedFollower:
+    """Walks along a direction by a multilayer perceptron with ReLU and a tanh at the end.
+
+    Its input is the robot's own state, which is the observation without x and y, followed by the
+    direction.
+
+    Attributes:
+        robot: The robot it can drive, such as `ant`.
+        weights: Of each layer, shape (fan in, fan out), float32.
+        biases: Of each layer, shape (fan out,), float32.
+        metadata: How it was trained.
+    """
+
+    robot: str
+    weights: tuple[np.ndarray, ...]
+    biases: tuple[np.ndarray, ...]
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse layers that do not fit together.
+
+        Raises:
+            ControllerError: If a weight or bias has another shape or type, or is not finite.
+        """
+        for before, after in pairwise(self.weights):
+            if before.ndim != 2 or after.ndim != 2 or before.shape[1] != after.shape[0]:
+                raise ControllerError(f'layers {before.shape} and {after.shape} do not fit')
+        for weight, bias in zip(self.weights, self.biases, strict=True):
+            if bias.shape != weight.shape[1:]:
+                raise ControllerError(f'layer {weight.shape} has a bias of shape {bias.shape}')
+            for array in (weight, bias):
+                if array.dtype != np.float32 or not np.isfinite(array).all():
+                    raise ControllerError(
+                        f'weights must be finite float32, got {array.dtype} of shape {array.shape}'
+                    )
+
+    @property
+    def obs_dim(self) -> int:
+        """Numbers in an observation of the robot, x and y included."""
+        return len(self.weights[0])  # without x and y, but with the direction
+
+    @property
+    def act_dim(self) -> int:
+        """Numbers in an action."""
+        return self.weights[-1].shape[1]
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the weights: tells which controller made a dataset."""
+        return hashlib.sha256(self._serialized()).hexdigest()
+
+    def act(self, observation: Array, direction: Array) -> Array:
+        """Action for an observation of shape (obs_dim,) that moves along `direction`."""
+        return self.network(np.concatenate([observation[2:], direction]))
+
+    def network(self, inputs: Array) -> Array:
+        """Action for the robot's own state and the direction, shape (obs_dim,)."""
+        x = inputs.astype(np.float32)
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            x = np.maximum(x @ weight + bias, 0)
+        return np.tanh(x @ self.weights[-1] + self.biases[-1]).astype(np.float64)
+
+    def save(self, folder: Path) -> None:
+        """Write the controller to a folder, made if missing, atomically.
+
+        The weights go to a file named by their hash, then `controller.json`, which names that
+        hash, is replaced. A crash in between leaves the previous controller whole.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        index = _Index(
+            robot=self.robot,
+            layers=len(self.weights),
+            sha256=self.sha256,
+            metadata=self.metadata,
+        )
+        with atomic_file(folder / index.weights) as temporary:
+            temporary.write_bytes(self._serialized())
+        write_json(folder / _INDEX, index.model_dump())
+        for old in folder.glob('weights-*.safetensors'):
+            if old.name != index.weights:
+                old.unlink()
+
+    @classmethod
+    def load(cls, folder: Path) -> Self:
+        """Read what `save` wrote.
+
+        Raises:
+            ControllerError: If there is none, or it is damaged; the message names the file.
+        """
+        try:
+            index = _Index.model_validate_json((folder / _INDEX).read_bytes())
+            tensors = safetensors.numpy.load((folder / index.weights).read_bytes())
+            layers = range(index.layers)
+            follower = cls(
+                index.robot,
+                weights=tuple(tensors[f'weight{i}'] for i in layers),
+                biases=tuple(tensors[f'bias{i}'] for i in layers),
+                metadata=index.metadata,
+            )
+        except OSError as error:
+            raise ControllerError(f'{folder}: no direction controller there ({error})') from error
+        except (ValidationError, SafetensorError, KeyError, ControllerError) as error:
+            raise ControllerError(f'{folder}: holds no usable controller: {error}') from error
+        if follower.sha256 != index.sha256:
+            raise ControllerError(f'{folder / index.weights}: does not match the hash in its name')
+        return follower
+
+    def _serialized(self) -> bytes:
+        tensors = {f'weight{i}': weight for i, weight in enumerate(self.weights)}
+        tensors |= {f'bias{i}': bias for i, bias in enumerate(self.biases)}
+        return safetensors.numpy.save(tensors)

@@ -1,0 +1,32 @@
+"""Falls, counted from the torso's quaternion."""
+
+import math
+
+import numpy as np
+import pytest
+from sim_bridge.posture import count_falls, uprightness
+
+
+def pose(lean_rad: float, yaw_rad: float = 0.0) -> np.ndarray:
+    """A pose that leans about x, after a turn about z: quaternion product z-turn * x-lean."""
+    cx, sx = math.cos(lean_rad / 2), math.sin(lean_rad / 2)
+    cz, sz = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
+    return np.array([5.0, -3.0, 0.6, cz * cx, cz * sx, sz * sx, sz * cx, 0.1])
+
+
+@pytest.mark.parametrize('lean_deg', [0, 30, 60, 90, 135, 180])
+def test_uprightness_is_the_cosine_of_the_lean_whatever_the_heading(lean_deg: int) -> None:
+    lean = math.radians(lean_deg)
+    poses = np.array([pose(lean, yaw) for yaw in (0.0, 1.0, -2.5)])
+    np.testing.assert_allclose(uprightness(poses), math.cos(lean), atol=1e-12)
+
+
+def test_each_fall_counts_once_and_getting_up_between_two_makes_two() -> None:
+    up, down = pose(0.2), pose(2.0)
+    assert count_falls(np.array([up, up, down, down, up, down])) == 2
+    assert count_falls(np.array([down, up, up])) == 1
+    assert count_falls(np.array([up, up])) == 0
+
+
+def test_point_cannot_fall() -> None:
+    assert count_falls(np.zeros((4, 2))) == 0
