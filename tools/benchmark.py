@@ -4,17 +4,23 @@ from collections.abc import Callable
 
 import tyro
 
+from tools.benchmarks.meta import MetaBenchmark
 from tools.benchmarks.report import Benchmark
 from tools.benchmarks.retrieval import RetrievalBenchmark
 from tools.benchmarks.ros import RosBenchmark
+from tools.benchmarks.sim import SimBenchmark
+from tools.benchmarks.training import TrainingBenchmark
 
 _DESCRIPTION = """Measure speed against a baseline in the same run.
 
-Examples: python -m tools.benchmark retrieval, python -m tools.benchmark ros"""
+Examples: python -m tools.benchmark retrieval, python -m tools.benchmark training"""
 
 BENCHMARKS: dict[str, Callable[..., Benchmark]] = {
+    'meta': MetaBenchmark,
     'retrieval': RetrievalBenchmark,
     'ros': RosBenchmark,
+    'sim': SimBenchmark,
+    'training': TrainingBenchmark,
 }
 
 

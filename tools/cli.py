@@ -37,8 +37,10 @@ def parse(
     preset, rest = tyro.cli(_Preset, args=arguments, return_unknown_args=True, add_help=False)
     try:
         values = preset_values(preset.preset, section)
+        names = [name for name in preset_names() if not name.startswith('paper-')]
         description += (
-            f'\n\n--preset NAME_OR_PATH starts from a preset: {", ".join(preset_names())}.'
+            f'\n\n--preset NAME_OR_PATH starts from a preset: {", ".join(names)} '
+            'or one of python -m tools.presets.'
         )
         default = model.model_validate(values)
         return tyro.cli(model, args=rest, default=default, description=description)

@@ -18,6 +18,7 @@ from metagcttt_core import (
     TrajectoryFilter,
     TTTConfig,
 )
+from metagcttt_core.agents.gciql import ActorLoss
 from metagcttt_core.config import Settings
 from metagcttt_core.files import atomic_write
 import numpy as np
@@ -40,12 +41,9 @@ Job = tuple[str, str, int, int, int]
 """Checkpoint, environment, budget, seed and task."""
 
 
-class EvaluateSettings(Settings):
-    """Settings of the tool."""
+class ProtocolSettings(Settings):
+    """How policies are evaluated."""
 
-    checkpoints: tuple[Path, ...] = Field(
-        (Path('out/pretrain/checkpoint'),), min_length=1, description='policies to evaluate'
-    )
     dataset: Path = Field(
         Path('data/pointmaze-medium-navigate-v0.npz'), description='dataset to adapt on (npz)'
     )
@@ -53,12 +51,23 @@ class EvaluateSettings(Settings):
         (0, 10, 20, 50, 100, 200), min_length=1, description='numbers of gradient steps K'
     )
     ttt: TTTConfig = Field(TTTConfig(), description='test-time training (steps come from budgets)')
+    actor_loss: ActorLoss | None = Field(
+        None, description="to adapt GCIQL policies with; each policy's own by default"
+    )
     filter: FilterConfig = FilterConfig()
     episodes: int = Field(10, ge=1, description='episodes per task and seed')
     seeds: tuple[int, ...] = Field((0, 1, 2), min_length=1, description='evaluation seeds')
     processes: int = Field(2, ge=1, description='processes to spread the work over')
-    out: Path = Field(Path('out/evaluation.json'), description='file for the results')
     resume: bool = Field(False, description='keep what an interrupted call finished')
+
+
+class EvaluateSettings(ProtocolSettings):
+    """Settings of the tool."""
+
+    checkpoints: tuple[Path, ...] = Field(
+        (Path('out/pretrain/checkpoint'),), min_length=1, description='policies to evaluate'
+    )
+    out: Path = Field(Path('out/evaluation.json'), description='file for the results')
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -180,7 +189,11 @@ def _success_rate(job: Job) -> float:
     path, environment, budget, seed, task = job
     simulator = make_simulator(environment)
     result = evaluate_success(
-        load_checkpoint(path, environment=environment),
+        load_checkpoint(
+            path,
+            environment=environment,
+            changes=_Worker.settings.model_dump(include={'actor_loss'}, exclude_none=True),
+        ),
         simulator,
         ttt=_Worker.settings.ttt.model_copy(update={'steps': budget}),
         episodes=_Worker.settings.episodes,

@@ -5,14 +5,17 @@ from pathlib import Path
 import sys
 import time
 
+from metagcttt_core import TrajectoryDataset
 from metagcttt_core.config import Settings
 from pydantic import Field
+from sim_bridge import describe_environment
 from sim_bridge.behaviours import Kind
 from sim_bridge.generate import generate, OutputPaths
 from sim_bridge.plan import plan_dataset
 from tqdm import tqdm
 
 from tools.cli import fail, parse
+from tools.plots import coverage_picture, save
 
 DESCRIPTION = """Generate an offline dataset of a maze in OGBench's npz format.
 
@@ -28,8 +31,12 @@ Example, 1000 episodes of 1001 rows, about two minutes on one core:
 
   python -m tools.generate_data --environment pointmaze-medium-v0 --kind navigate
 
-writes data/pointmaze-medium-navigate-v0.npz, ...-val.npz (a tenth as many episodes) and
-...-v0.json (settings, versions, statistics)."""
+writes data/pointmaze-medium-navigate-v0.npz, ...-val.npz (a tenth as many episodes),
+...-v0.json (settings, versions, statistics) and ...-v0.png (where the robot has been).
+
+The ant walks by the controller in sim_bridge/controllers/weights. The humanoid needs one to be
+trained first (python -m tools.train_controller --robot humanoid) and given as --controller.
+Where there is a network, tools.download_data fetches OGBench's published files instead."""
 
 
 class GenerateSettings(Settings):
@@ -54,6 +61,9 @@ class GenerateSettings(Settings):
         default_factory=lambda: len(os.sched_getaffinity(0)),
         ge=1,
         description='Worker processes; all cores by default.',
+    )
+    controller: Path | None = Field(
+        None, description='Folder of a learned controller; the one of the package by default.'
     )
     resume: bool = Field(False, description='Go on with what an interrupted run left.')
     overwrite: bool = Field(False, description='Replace an existing dataset.')
@@ -95,13 +105,24 @@ def _run(settings: GenerateSettings) -> None:
             resume=settings.resume,
             overwrite=settings.overwrite,
             progress=show,
+            controller=settings.controller,
         )
+    picture = output.with_suffix('.png')
+    _draw(plan.environment, output, picture)
     print(f'wrote     {output} and {OutputPaths(output).validation.name}')
     print(f'episodes  {plan.episodes} + {plan.validation_episodes} for validation')
     print(f'rows      {statistics.rows} + {statistics.validation_rows}')
     print(f'goals     {statistics.goals_per_episode:.2f} reached per episode')
+    print(f'falls     {statistics.falls_per_episode:.3f} per episode')
     print(f'coverage  {statistics.coverage:.1%} of the free cells visited')
+    print(f'picture   {picture}')
     print(f'seconds   {time.monotonic() - started:.1f}')
+
+
+def _draw(environment: str, dataset: Path, picture: Path) -> None:
+    description = describe_environment(environment)
+    positions = TrajectoryDataset.load(dataset).observations[:, description.spec.position_dims]
+    save(coverage_picture(description.maze, positions), picture)
 
 
 def default_output(environment: str, kind: Kind) -> Path:

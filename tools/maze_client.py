@@ -60,7 +60,7 @@ class MazeClient(RobotCommander):
         self.create_subscription(
             MazeState, 'state', lambda state: self._seen.states.append(state), _RELIABLE
         )
-        self.create_subscription(
+        self._events = self.create_subscription(
             EpisodeEvent, 'episode', lambda event: self._seen.events.append(event), _RELIABLE
         )
         self._reports = self.create_subscription(
@@ -71,18 +71,19 @@ class MazeClient(RobotCommander):
         )
 
     def wait_until_ready(self, timeout_s: float = 30.0) -> None:
-        """Wait for the three nodes."""
-        self.wait(self._set_task.service_is_ready, 'service set_task', timeout_s)
-        for topic, needed in (('goal_pose', 1), ('action', 1), ('goal', 1)):
-            self.wait(
-                partial(self._has_subscribers, topic, needed),
-                f'a subscriber of {topic}',
-                timeout_s,
-            )
-        self.wait(
-            lambda: self._goal_pose.get_subscription_count() >= 1, 'the goal node', timeout_s
-        )
-        self.wait(lambda: self.count_publishers('action') >= 1, 'the policy node', timeout_s)
+        """Wait until the three nodes hear each other and this program."""
+        for found, what in (
+            (self._set_task.service_is_ready, 'service set_task'),
+            (self._goal_pose.get_subscription_count, 'a subscriber of goal_pose'),
+            (partial(self.count_subscribers, 'action'), 'a subscriber of action'),
+            (partial(self.count_subscribers, 'goal'), 'a subscriber of goal'),
+            (self._reports.get_publisher_count, 'a publisher of adaptation'),
+            (
+                lambda: self._events.get_publisher_count() >= 2,
+                'simulator and goal node on episode',
+            ),
+        ):
+            self.wait(found, what, timeout_s)
 
     def drive(self, task_id: int, seed: int, timeout_s: float = 60.0) -> GoalOutcome:
         """Put the robot at a task's start, publish its goal and watch what becomes of it."""
@@ -144,9 +145,6 @@ class MazeClient(RobotCommander):
 
     def _is_answered(self, known: int) -> bool:
         return bool(self._answers(known))
-
-    def _has_subscribers(self, topic: str, needed: int) -> bool:
-        return self.count_subscribers(topic) >= needed
 
     def _events_of(self, query_id: int, kinds: tuple[int, ...]) -> list[EpisodeEvent]:
         return [e for e in self._seen.events if e.query_id == query_id and e.kind in kinds]

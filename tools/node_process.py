@@ -8,6 +8,8 @@ import subprocess
 from typing import Self
 
 _ROS2RUN = Path(__file__).with_name('ros2run')
+# Also when the owner is killed.
+_ENDS_WITH_ITS_OWNER = ('setpriv', '--pdeathsig', 'TERM')
 _LOG_LINES = 30
 
 
@@ -37,7 +39,7 @@ class NodeProcess:
         """
         self.executable = executable
         self.log = log
-        command = [str(_ROS2RUN), 'metagcttt', executable, '--ros-args']
+        command = [*_ENDS_WITH_ITS_OWNER, str(_ROS2RUN), 'metagcttt', executable, '--ros-args']
         for name, value in parameters.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             command += ['-p', f'{name}:={text}']

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -11,6 +12,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 import numpy as np
+from sim_bridge.controllers.walk import Walk
 from sim_bridge.maze_map import MazeMap
 
 # Okabe and Ito's palette: told apart by colour-blind readers too.
@@ -90,3 +92,104 @@ def demo_picture(
     ]
     figure.legend(handles=handles, loc='outside lower center', ncols=len(handles), frameon=False)
     return figure
+
+
+def coverage_picture(maze: MazeMap, positions: np.ndarray, bins_per_cell: int = 8) -> Figure:
+    """How often a dataset has been where; positions of shape (N, 2) in metres."""
+    xmin, xmax, ymin, ymax = maze.extent
+    rows, cols = (bins_per_cell * count for count in maze.walls.shape)
+    counts, _, _ = np.histogram2d(
+        positions[:, 1], positions[:, 0], (rows, cols), ((ymin, ymax), (xmin, xmax))
+    )
+    figure = Figure(figsize=(4.6, 4), layout='constrained')
+    axes = figure.subplots()
+    draw_maze(axes, maze)
+    visited = np.ma.masked_equal(counts, 0)
+    image = axes.imshow(visited, extent=maze.extent, origin='lower', norm='log', cmap='viridis')
+    figure.colorbar(image, label=f'rows per square of {maze.unit_m / bins_per_cell:g} m')
+    return figure
+
+
+def controller_picture(walks: Sequence[Sequence[Walk]]) -> Figure:
+    """Paths and speed along each direction; one sequence of walks a direction."""
+    figure = Figure(figsize=(8.4, 3.8), layout='constrained')
+    paths, speeds = figure.subplots(1, 2)
+    for number, same_direction in enumerate(walks):
+        color = COLORS[number % len(COLORS)]
+        end = max(walk.distance_m for walk in same_direction) * same_direction[0].direction
+        paths.plot((0, end[0]), (0, end[1]), color='black', linewidth=0.8, linestyle=':')
+        for walk in same_direction:
+            paths.plot(*(walk.path - walk.path[0]).T, color=color, linewidth=1)
+        angle_deg = round(np.degrees(np.arctan2(*same_direction[0].direction[::-1]))) % 360
+        mean = np.mean([walk.speed for walk in same_direction])
+        speeds.bar(str(angle_deg), mean, color=color, alpha=0.5)
+        speeds.scatter(
+            [str(angle_deg)] * len(same_direction),
+            [walk.speed for walk in same_direction],
+            color=color,
+            s=12,
+        )
+    paths.set_aspect('equal')
+    paths.set_xlabel('x (m)')
+    paths.set_ylabel('y (m)')
+    speeds.set_xlabel('direction (degrees)')
+    speeds.set_ylabel('speed along the direction (m/s)')
+    return figure
+
+
+def success_curves(adaptations: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Figure:
+    """Success by steps of test-time training, one panel an adaptation, one line an arm.
+
+    Args:
+        adaptations: By name and arm: `budgets`, `success` and `standard_error`, equally long.
+    """
+    figure = Figure(figsize=(0.6 + 4.4 * len(adaptations), 3.6), layout='constrained')
+    panels = np.atleast_1d(figure.subplots(1, len(adaptations), sharey=True))
+    for axes, (name, arms) in zip(panels, adaptations.items(), strict=True):
+        for number, (arm, curve) in enumerate(arms.items()):
+            positions = np.arange(len(curve['budgets']))
+            _success_line(axes, positions, curve, arm, number)
+            axes.set_xticks(positions, [str(budget) for budget in curve['budgets']])
+        axes.set_xlabel('steps of test-time training K')
+        if len(adaptations) > 1:
+            axes.set_title(name)
+        if len(arms) > 1:
+            axes.legend(loc='lower right', frameon=False)
+    panels[0].set_ylabel('success')
+    return figure
+
+
+def post_training_curves(curve: Mapping[str, Mapping[float, Mapping[str, Any]]]) -> Figure:
+    """Success over post-training, one panel an arm, one line a budget (paper, figure 5).
+
+    Args:
+        curve: By arm and fraction of the outer steps: `budgets`, `success`, `standard_error`.
+    """
+    figure = Figure(figsize=(0.6 + 3 * len(curve), 3.2), layout='constrained')
+    panels = np.atleast_1d(figure.subplots(1, len(curve), sharey=True))
+    for axes, (arm, points) in zip(panels, curve.items(), strict=True):
+        budgets = next(iter(points.values()))['budgets']
+        for number, budget in enumerate(budgets):
+            line = {
+                name: [point[name][number] for point in points.values()]
+                for name in ('success', 'standard_error')
+            }
+            fractions = 100 * np.array(list(points))
+            _success_line(axes, fractions, line, f'K = {budget}', number)
+        axes.set_xlabel('outer steps, percent')
+        axes.set_title(arm)
+    panels[0].set_ylabel('success')
+    figure.legend(*panels[0].get_legend_handles_labels(), loc='outside right upper', frameon=False)
+    return figure
+
+
+def _success_line(
+    axes: Axes, x: np.ndarray, curve: Mapping[str, Any], label: str, number: int
+) -> None:
+    color = COLORS[number % len(COLORS)]
+    style = ('-', '--', ':')[number // len(COLORS) % 3]
+    mean, error = np.array(curve['success']), np.array(curve['standard_error'])
+    axes.plot(x, mean, color=color, linestyle=style, marker='o', markersize=3.5, label=label)
+    axes.fill_between(x, mean - error, mean + error, color=color, alpha=0.15, linewidth=0)
+    axes.set_ylim(-0.02, 1.02)
+    axes.grid(alpha=0.25)

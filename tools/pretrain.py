@@ -1,14 +1,28 @@
 """Pre-train a goal-conditioned policy on an offline dataset."""
 
+from functools import partial
 from pathlib import Path
+from typing import Annotated, Any, Self
 
-from metagcttt_core import CheckpointError, DatasetError, make_agent, TrajectoryDataset
+from metagcttt_core import Agent, CheckpointError, DatasetError, make_agent, TrajectoryDataset
 from metagcttt_core.agents import AgentName
+from metagcttt_core.agents.gcbc import GCBCSettings
+from metagcttt_core.agents.gciql import GCIQLSettings
+from metagcttt_core.training.numerics import Precision, resolve_precision
 from metagcttt_core.training.pretrain import pretrain, PretrainConfig
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor
+import tyro
 
 from tools.cli import fail, parse
+from tools.progress import (
+    as_scalars,
+    keep_snapshot,
+    success_rates,
+    Throughput,
+    Validation,
+    validation_data,
+)
 from tools.runs import provenance, RunSettings, training_session, use_threads
 
 _DESCRIPTION = """Pre-train a goal-conditioned policy on an offline dataset.
@@ -25,9 +39,35 @@ class PretrainSettings(RunSettings):
     out: Path = Field(Path('out/pretrain'), description='folder of the run')
     agent: AgentName = Field('gcbc', description='kind of agent')
     hidden: tuple[int, ...] = Field((512, 512, 512), description='units of each hidden layer')
+    gcbc: Annotated[GCBCSettings, tyro.conf.AvoidSubcommands] = GCBCSettings()
+    gciql: Annotated[GCIQLSettings, tyro.conf.AvoidSubcommands] = GCIQLSettings()
     training: PretrainConfig = PretrainConfig()
+    precision: Precision = Field(
+        'float32', description='of matrix products; auto is bfloat16 where the device gains by it'
+    )
+    compiled: bool = Field(False, description='compile the loss: half a minute, then faster steps')
     checkpoint_every: int = Field(5000, ge=1, description='steps between checkpoints')
-    log_every: int = Field(500, ge=1, description='steps between log lines')
+    log_every: int = Field(
+        500, ge=1, description='steps between log lines; with DATASET-val.npz, of its losses too'
+    )
+    snapshot_every: int | None = Field(
+        None, ge=1, description='steps between policies kept in OUT/snapshots'
+    )
+    evaluate_every: int | None = Field(
+        None, ge=1, description='steps between evaluations of the policy in its simulator'
+    )
+    evaluation_episodes: int = Field(10, ge=1, description='episodes per task of an evaluation')
+
+    @property
+    def agent_settings(self) -> dict[str, Any]:
+        """Settings of the chosen agent other than its units."""
+        return getattr(self, self.agent).model_dump(exclude={'hidden'})
+
+    @model_validator(mode='after')
+    def _units_in_one_place(self) -> Self:
+        if 'hidden' in getattr(self, self.agent).model_dump(exclude_defaults=True):
+            raise ValueError(f'{self.agent}.hidden has no effect here; set hidden')
+        return self
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -48,27 +88,58 @@ def _run(settings: PretrainSettings) -> None:
         act_dim=dataset.act_dim,
         hidden=settings.hidden,
         seed=settings.seed,
-    )
+        **settings.agent_settings,
+    ).to(settings.device)
     decisive = settings.model_dump(
         mode='json', include={'agent', 'hidden', 'training', 'seed', 'threads'}
     )
+    decisive |= settings.model_dump(include={'device', 'compiled'}, exclude_defaults=True)
+    precision = resolve_precision(settings.precision, agent.device)
+    if precision != 'float32':
+        decisive['precision'] = precision
     decisive['dataset'] = settings.dataset.name
     agent.metadata = {
         'environment': settings.environment,
         'history': [{'stage': 'pretrain', **decisive, **provenance()}],
     }
+    held_out = validation_data(settings.dataset, dataset)
+    validation = Validation(held_out, settings.training.batch_size, precision)
     with training_session(settings, 'pretrain', decisive, settings.training.steps) as session:
+        throughput = Throughput()
 
-        def on_step(step: int, losses: dict[str, Tensor]) -> None:
+        def on_step(step: int, losses: dict[str, Tensor], agent: Agent) -> None:
             session.bar.update()
-            if step % settings.log_every == 0:
-                scalars = {f'train/{name}': float(value) for name, value in losses.items()}
-                session.log.write(step, scalars)
+            throughput.count()
+            due = partial(_is_due, step)
+            scalars: dict[str, float] = {}
+            if due(settings.log_every):
+                scalars = as_scalars(losses) | {'speed/updates_per_s': throughput.rate()}
                 session.bar.set_postfix(loss=f'{scalars["train/loss"]:.4f}')
+                scalars |= validation.losses(agent, settings.seed, step)
+            if due(settings.evaluate_every):
+                scalars |= success_rates(
+                    agent, settings.environment, settings.evaluation_episodes, settings.seed
+                )
+            if due(settings.snapshot_every):
+                keep_snapshot(agent, settings.out, step)
+            if scalars:
+                session.log.write(step, scalars)
+                throughput.restart()
 
         pretrain(
-            agent, dataset, settings.training, settings.seed, run=session.run, on_step=on_step
+            agent,
+            dataset,
+            settings.training,
+            settings.seed,
+            precision=precision,
+            compiled=settings.compiled,
+            run=session.run,
+            on_step=on_step,
         )
+
+
+def _is_due(step: int, every: int | None) -> bool:
+    return every is not None and step % every == 0
 
 
 if __name__ == '__main__':

@@ -1,65 +1,32 @@
 """What the long-running tools share: logs, provenance, interruption."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 import json
+import os
 from pathlib import Path
 import signal
 import subprocess
+import sys
 import threading
-import time
-from typing import Any, Self
+from typing import Any
 
 from metagcttt_core.config import Settings
+from metagcttt_core.files import atomic_write
+from metagcttt_core.meta.parallel import any_process, first_process
 from metagcttt_core.training.checkpoint import has_checkpoint, load_training_state
 from metagcttt_core.training.run import TrainingInterrupted, TrainingRun
-from pydantic import Field
+from pydantic import Field, field_validator
 import torch
-from torch.utils.tensorboard import SummaryWriter
+from torch import distributed
 from tqdm import tqdm
 
 from tools.cli import fail
+from tools.run_log import RunLog, SilentLog
 
 _PACKAGES = ('torch', 'numpy', 'mujoco', 'ogbench')
-
-
-class RunLog:
-    """Scalars of a run, to TensorBoard and to the JSON-lines file `metrics.jsonl`."""
-
-    def __init__(self, folder: Path, first_step: int) -> None:
-        """Open the logs in `folder`; lines of a resumed run beyond `first_step` are dropped."""
-        folder.mkdir(parents=True, exist_ok=True)
-        self._path = folder / 'metrics.jsonl'
-        kept: list[str] = []
-        if first_step > 0 and self._path.exists():
-            lines = self._path.read_text(encoding='utf-8').splitlines()
-            kept = [line for line in lines if json.loads(line)['step'] <= first_step]
-        self._file = self._path.open('w', encoding='utf-8')
-        self._file.writelines(f'{line}\n' for line in kept)
-        self._writer = SummaryWriter(str(folder / 'tensorboard'), purge_step=first_step)
-
-    def write(self, step: int, scalars: Mapping[str, float | None]) -> None:
-        """Record scalars by name; those that are None are left out."""
-        known = {name: value for name, value in scalars.items() if value is not None}
-        self._file.write(json.dumps({'step': step, 'time': round(time.time(), 3), **known}) + '\n')
-        self._file.flush()
-        for name, value in known.items():
-            self._writer.add_scalar(name, value, step)
-
-    def close(self) -> None:
-        """Flush and close."""
-        self._file.close()
-        self._writer.close()
-
-    def __enter__(self) -> Self:
-        """The log itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close."""
-        self.close()
 
 
 class RunSettings(Settings):
@@ -73,7 +40,20 @@ class RunSettings(Settings):
     checkpoint_every: int = Field(1000, ge=1, description='steps between checkpoints')
     log_every: int = Field(100, ge=1, description='steps between log lines')
     threads: int = Field(1, ge=1, description='threads for tensor operations')
+    device: str = Field('cpu', description='where to compute: cpu, cuda or cuda:NUMBER')
     resume: bool = Field(False, description='go on from the checkpoint in OUT, if there is one')
+
+    @field_validator('device')
+    @classmethod
+    def _must_be_here(cls, device: str) -> str:
+        kind, _, number = device.partition(':')
+        count = {'cpu': 1, 'cuda': torch.cuda.device_count()}.get(kind, 0)
+        if not (number or '0').isdigit() or int(number or '0') >= count:
+            raise ValueError(
+                f'must be cpu, cuda or cuda:NUMBER; this machine has {torch.cuda.device_count()} '
+                'CUDA devices'
+            )
+        return device
 
     @property
     def checkpoint_folder(self) -> Path:
@@ -89,12 +69,19 @@ class Session:
     log: RunLog
     bar: tqdm
 
+    def warn(self, step: int, warnings: Sequence[str]) -> None:
+        """Say what looks bad, above the progress bar."""
+        for warning in warnings:
+            self.bar.write(f'warning: after step {step}: {warning}', file=sys.stderr)
+
 
 @contextmanager
 def training_session(
     settings: RunSettings, stage: str, decisive: dict[str, Any], steps: int
 ) -> Iterator[Session]:
     """Logs, checkpoints and a clean end for a training tool.
+
+    Of the processes that `torchrun` starts, the first one writes.
 
     Args:
         settings: The tool's settings.
@@ -103,34 +90,64 @@ def training_session(
         steps: Number of steps of the whole run.
 
     Raises:
-        SystemExit: With status 130 after Ctrl-C or SIGTERM, everything done so far being saved.
+        SystemExit: With status 130 after Ctrl-C or SIGTERM, everything done so far being saved;
+            with status 2 when something cannot be written, the last checkpoint being left whole.
     """
     folder = settings.checkpoint_folder
     exists = has_checkpoint(folder)
     if exists and not settings.resume:
         fail(f'{folder} holds a checkpoint: go on with --resume, or choose another --out')
-    write_settings(settings.out, settings)
     first = load_training_state(folder).step if exists else 0
-    with (
-        stop_on_signal() as stop,
-        RunLog(settings.out, first) as log,
-        tqdm(total=steps, initial=first, unit='step', desc=stage) as bar,
-    ):
-        run = TrainingRun(
-            stage,
-            decisive,
-            folder,
-            every=settings.checkpoint_every,
-            resume=settings.resume,
-            should_stop=stop.is_set,
-        )
-        try:
+    writes = first_process()
+    try:
+        if writes:
+            write_settings(settings.out, settings)
+        with (
+            stop_on_signal() as stop,
+            RunLog(settings.out, first) if writes else SilentLog() as log,
+            tqdm(total=steps, initial=first, unit='step', desc=stage, disable=not writes) as bar,
+        ):
+            run = TrainingRun(
+                stage,
+                decisive,
+                folder,
+                every=settings.checkpoint_every,
+                resume=settings.resume,
+                should_stop=lambda: any_process(stop.is_set(), torch.device(settings.device)),
+                writes=writes,
+            )
             yield Session(run, log, bar)
-        except TrainingInterrupted as interruption:
-            bar.close()
+    except TrainingInterrupted as interruption:
+        if writes:
             print(f'{interruption}; go on with --resume')
-            raise SystemExit(130) from interruption
-    print(f'policy: {folder}')
+        raise SystemExit(130) from interruption
+    except OSError as error:
+        fail(f'{settings.out}: cannot be written ({error}); {left_behind(settings)}')
+    if writes:
+        print(f'policy: {folder}')
+
+
+def left_behind(settings: RunSettings) -> str:
+    """What there is to go on from after a failure, in words."""
+    if not has_checkpoint(settings.checkpoint_folder):
+        return 'there is no checkpoint yet'
+    step = load_training_state(settings.checkpoint_folder).step
+    return f'the checkpoint of step {step} is whole'
+
+
+@contextmanager
+def process_group(device: str) -> Iterator[None]:
+    """Connects the processes that `torchrun` started; without it there is nothing to connect."""
+    if not distributed.is_torchelastic_launched():
+        yield
+        return
+    if device == 'cuda':
+        torch.cuda.set_device(int(os.environ['LOCAL_RANK']))
+    distributed.init_process_group('gloo' if device == 'cpu' else 'nccl')
+    try:
+        yield
+    finally:
+        distributed.destroy_process_group()
 
 
 @contextmanager
@@ -167,9 +184,9 @@ def provenance() -> dict[str, Any]:
 
 def write_settings(folder: Path, settings: Settings) -> None:
     """The resolved settings, beside a run's results."""
-    folder.mkdir(parents=True, exist_ok=True)
     record = {'settings': settings.model_dump(mode='json'), **provenance()}
-    (folder / 'settings.json').write_text(json.dumps(record, indent=2) + '\n', encoding='utf-8')
+    with atomic_write(folder / 'settings.json') as file:
+        file.write((json.dumps(record, indent=2) + '\n').encode())
 
 
 def use_threads(count: int) -> None:

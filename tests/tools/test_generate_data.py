@@ -28,13 +28,14 @@ def test_default_output_is_named_as_ogbench_names_it(capsys: pytest.CaptureFixtu
         'data/pointmaze-medium-stitch-v0-val.npz',
         'data/pointmaze-medium-stitch-v0.json',
         'data/pointmaze-medium-stitch-v0.npz',
+        'data/pointmaze-medium-stitch-v0.png',
     ]
     dataset = TrajectoryDataset.load('data/pointmaze-medium-stitch-v0.npz')
     assert (dataset.num_episodes, dataset.num_rows) == (12, 612)
     out = capsys.readouterr().out
     assert 'episodes  12 + 1 for validation' in out
     assert 'rows      612 + 51' in out
-    for label in ('goals', 'coverage', 'seconds'):
+    for label in ('goals', 'falls', 'coverage', 'picture', 'seconds'):
         assert label in out
 
 
@@ -52,7 +53,7 @@ def test_flags_reach_the_plan() -> None:
     ('arguments', 'message'),
     [
         (['--environment', 'pointmaze-mediun-v0'], "did you mean 'pointmaze-medium-v0'"),
-        (['--environment', 'antmaze-medium-v0'], 'learned direction controller'),
+        (['--environment', 'humanoidmaze-medium-v0'], 'tools.train_controller --robot humanoid'),
         (['--output', 'here.zip'], 'must end in .npz, got here.zip'),
         (['--kind', 'play'], 'play'),
         (['--episodes', '0'], 'episodes'),

@@ -8,9 +8,10 @@ import subprocess
 import sys
 import time
 
-from metagcttt_core import load_checkpoint, TrajectoryDataset
+from metagcttt_core import load_checkpoint
 import numpy as np
 import pytest
+from tests.core.builders import maze_walks
 from tools import evaluate, meta_train, pretrain
 import torch
 
@@ -20,15 +21,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture(scope='module')
 def dataset_path(tmp_path_factory):
-    """Trajectories that wander through the whole maze's square, so that every task finds some."""
-    rng = np.random.default_rng(0)
-    steps = rng.normal(0, 0.6, size=(40, 101, 2)).cumsum(axis=1)
-    observations = (steps + rng.uniform(0, 20, size=(40, 1, 2))).reshape(-1, 2)
-    terminals = np.zeros(len(observations), bool)
-    terminals[100::101] = True
-    actions = np.clip(rng.normal(size=observations.shape), -1, 1)
     path = tmp_path_factory.mktemp('data') / 'walks.npz'
-    TrajectoryDataset.from_arrays(observations, actions, terminals).save(path)
+    maze_walks().save(path)
     return path
 
 
@@ -151,6 +145,19 @@ def test_evaluate_writes_success_by_budget_and_seed(dataset_path, base, tmp_path
         assert sorted(point['per_task']) == ['1', '2', '3', '4', '5']
         assert point['success'] == pytest.approx(np.mean(point['per_seed']))
     assert '| K = 0 | K = 1 | AUC |' in capsys.readouterr().out
+
+
+@pytest.mark.mujoco
+@pytest.mark.slow
+def test_evaluation_does_not_depend_on_the_number_of_processes(dataset_path, base, tmp_path):
+    arguments = ['--checkpoints', str(base), '--dataset', str(dataset_path), '--episodes', '1']
+    arguments += ['--budgets', '1', '--seeds', '3', '--ttt.batch-size', '16']
+    results = []
+    for processes in (1, 2):
+        out = tmp_path / f'{processes}.json'
+        evaluate.main([*arguments, '--processes', str(processes), '--out', str(out)])
+        results.append(json.loads(out.read_text())['results'])
+    assert results[0] == results[1]
 
 
 def test_evaluate_table_shows_mean_error_and_auc():

@@ -1,0 +1,99 @@
+"""Tables and figures of studies, from results written by hand."""
+
+import json
+
+import pytest
+from tools import report
+from tools.report import format_report, read_study
+
+RATES = {
+    'base-0': [0.2, 0.6, 0.8],
+    'base-1': [0.4, 0.8, 1.0],
+    'reptile-0': [0.8, 0.9, 1.0],
+    'reptile-1': [0.6, 0.9, 1.0],
+    'fomaml-k1-0': [0.0, 0.8, 0.8],
+}
+
+
+def results(rates, budgets, suffix='checkpoint'):
+    return [
+        {
+            'checkpoint': f'out/study/{run}/{suffix}',
+            'curve': [{'budget': b, 'success': s} for b, s in zip(budgets, row, strict=True)],
+        }
+        for run, row in rates.items()
+    ]
+
+
+@pytest.fixture
+def study(tmp_path):
+    settings = {'base': 'some-preset', 'out': 'out/study', 'curve_budgets': [0, 20]}
+    settings |= {'adaptations': {'ttt': {}}, 'curve': [0.5], 'seeds': [0, 1]}
+    (tmp_path / 'study.json').write_text(json.dumps({'settings': settings}))
+    evaluation = {'results': results(RATES, [0, 10, 20])}
+    (tmp_path / 'evaluation-ttt.json').write_text(json.dumps(evaluation))
+    half = {'reptile-0': [0.5, 0.7], 'reptile-1': [0.3, 0.9]}
+    curve = {'results': results(half, [0, 20], suffix='snapshots/000050')}
+    (tmp_path / 'curve.json').write_text(json.dumps(curve))
+    (tmp_path / 'reptile-0').mkdir()
+    run = {'settings': {'meta': {'outer_steps': 100}}}
+    (tmp_path / 'reptile-0' / 'settings.json').write_text(json.dumps(run))
+    return tmp_path
+
+
+def test_means_errors_auc_and_efficiency_by_hand(study):
+    arms = read_study(study)['adaptations']['ttt']
+    base, reptile, single = arms['base'], arms['reptile'], arms['fomaml-k1']
+    assert base['success'] == pytest.approx([0.3, 0.7, 0.9])
+    # The population standard deviation of (0.2, 0.4) is 0.1; over the square root of two.
+    assert base['standard_error'] == pytest.approx([0.1 / 2**0.5] * 3)
+    # Seed 0: (0.2 + 0.6) / 2 x 10 + (0.6 + 0.8) / 2 x 10 = 11 of 20; seed 1: 15 of 20.
+    assert base['auc_per_seed'] == pytest.approx([0.55, 0.75])
+    assert base['auc'] == pytest.approx(0.65)
+    assert base['auc_error'] == pytest.approx(0.1 / 2**0.5)
+    assert base['efficiency'] == 1  # itself
+    assert reptile['efficiency'] == 2  # 20 steps against 10
+    assert single['seeds'] == [0]
+    assert single['standard_error'] == [0, 0, 0]
+    assert single['efficiency'] == 2  # the base policy of seed 0 needs 20 steps
+
+
+def test_an_arm_that_needs_no_step_says_so_in_words(study):
+    arms = read_study(study, threshold=0.7)['adaptations']['ttt']
+    assert arms['reptile']['efficiency'] == 'no step needed'
+    assert json.loads(json.dumps(arms, allow_nan=False)) == arms
+
+
+def test_curve_goes_from_the_base_policy_to_the_post_trained_one(study):
+    points = read_study(study)['curve']['reptile']
+    assert list(points) == [0.0, 0.5, 1.0]
+    assert points[0.0]['success'] == pytest.approx([0.3, 0.9])
+    assert points[0.5]['success'] == pytest.approx([0.4, 0.8])
+    assert points[1.0]['success'] == pytest.approx([0.7, 1.0])
+
+
+def test_tables_show_every_arm(study):
+    text = format_report(read_study(study))
+    assert '| base | 2 | 0.30 ± 0.07 | 0.70 ± 0.07 | 0.90 ± 0.07 | 0.650 ± 0.071 |' in text
+    assert '| 0.550, 0.750 | 1x |' in text
+    assert '| fomaml-k1 | 1 | 0.00 ± 0.00 | 0.80 ± 0.00 | 0.80 ± 0.00 |' in text
+    assert '| reptile | 50% | 0.40 ± 0.07 | 0.80 ± 0.07 |' in text
+    assert 'python -m tools.sweep --preset some-preset' in text
+
+
+def test_the_tool_writes_tables_and_figures(study, tmp_path, capsys):
+    out = tmp_path / 'results' / 'study'
+    report.main([str(study), '--out', str(out)])
+    assert out.with_suffix('.md').read_text() in capsys.readouterr().out
+    assert json.loads(out.with_suffix('.json').read_text())['threshold'] == 0.8
+    for name in ('study.png', 'study-curve.png'):
+        assert (out.parent / name).read_bytes().startswith(b'\x89PNG')
+
+
+def test_unfinished_study_names_what_is_missing(study, capsys):
+    (study / 'evaluation-ttt.json').unlink()
+    with pytest.raises(SystemExit, match='2'):
+        report.main([str(study)])
+    error = capsys.readouterr().err
+    assert 'evaluation-ttt.json does not exist' in error
+    assert 'tools.sweep' in error

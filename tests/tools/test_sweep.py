@@ -1,0 +1,134 @@
+"""Studies: what they plan, and a whole one in miniature."""
+
+import json
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from tests.core.builders import maze_walks
+from tools import sweep
+from tools.sweep import is_evaluated, Study, SweepSettings
+import yaml
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def preset(tmp_path):
+    """A study of two seeds and two arms that takes seconds."""
+    dataset = tmp_path / 'walks.npz'
+    maze_walks().save(dataset)
+    path = tmp_path / 'preset.yaml'
+    meta = {'outer_steps': 4, 'inner_steps': 2, 'batch_size': 16}
+    values = {
+        'sweep': {
+            'base': str(path),
+            'seeds': [0, 1],
+            'arms': {
+                'reptile': {'meta': {'algorithm': 'reptile', 'meta_lr': 0.1}},
+                'one-step': {'meta': {'inner_steps': 1, 'early_stopping': False}, 'seeds': [1]},
+            },
+            'adaptations': {'full': {}, 'slow': {'lr': 1e-5}},
+            'curve': [0.5],
+            'curve_budgets': [0],
+            'out': str(tmp_path / 'study'),
+        },
+        'pretrain': {
+            'dataset': str(dataset),
+            'hidden': [16],
+            'training': {'steps': 20, 'batch_size': 32},
+        },
+        'meta_train': {'dataset': str(dataset), 'meta': meta},
+        'evaluate': {'dataset': str(dataset), 'budgets': [0, 1], 'episodes': 1, 'seeds': [0]},
+    }
+    path.write_text(yaml.safe_dump(values, sort_keys=False))
+    return path
+
+
+def study_of(preset, **different):
+    values = yaml.safe_load(preset.read_text())['sweep']
+    return Study(SweepSettings.model_validate(values | different))
+
+
+def test_each_run_differs_only_where_the_study_says(preset):
+    study = study_of(preset)
+    assert [run.seed for run in study.pretraining] == [0, 1]
+    names = [run.out.name for run in study.post_training]
+    assert names == ['reptile-0', 'reptile-1', 'one-step-1']
+    reptile, _, one_step = study.post_training
+    assert (reptile.meta.algorithm, reptile.meta.meta_lr) == ('reptile', 0.1)
+    assert (reptile.meta.inner_steps, reptile.meta.early_stopping) == (2, True)
+    assert (one_step.meta.inner_steps, one_step.meta.early_stopping) == (1, False)
+    assert one_step.checkpoint == study.pretraining[1].checkpoint_folder
+    assert reptile.snapshot_every == 2
+    full, slow = study.evaluations['full'], study.evaluations['slow']
+    assert slow.ttt == full.ttt.model_copy(update={'lr': 1e-5})
+    assert [path.parent.name for path in full.checkpoints] == ['base-0', 'base-1', *names]
+    snapshots = study.evaluations['curve'].checkpoints
+    assert [path.parts[-3:] for path in snapshots] == [
+        ('reptile-0', 'snapshots', '000002'),
+        ('reptile-1', 'snapshots', '000002'),
+    ]
+
+
+@pytest.mark.parametrize(
+    ('arm', 'message'),
+    [({'algorithm': 'reptil'}, 'algorithm'), ({'inner_step': 3}, "did you mean 'inner_steps'")],
+)
+def test_a_wrong_arm_is_refused_before_anything_runs(preset, arm, message):
+    with pytest.raises(ValueError, match=message):
+        study_of(preset, arms={'typo': {'meta': arm}})
+
+
+def test_curve_must_fit_the_snapshots(preset):
+    with pytest.raises(ValueError, match='multiples of its first fraction'):
+        study_of(preset, curve=[0.5, 0.75])
+
+
+def test_a_run_that_fails_ends_the_study_with_its_message(preset, capsys):
+    values = yaml.safe_load(preset.read_text())
+    values['pretrain']['dataset'] = 'missing.npz'
+    preset.write_text(yaml.safe_dump(values))
+    with pytest.raises(SystemExit, match='2'):
+        sweep.main(['--preset', str(preset)])
+    assert 'missing.npz: no such file' in capsys.readouterr().err
+
+
+def test_an_evaluation_is_done_once_it_is_there_with_the_same_settings(preset):
+    evaluation = study_of(preset).evaluations['full']
+    assert not is_evaluated(evaluation)
+    evaluation.out.parent.mkdir()
+    elsewhere = evaluation.model_copy(update={'processes': 7})
+    evaluation.out.write_text(json.dumps({'settings': elsewhere.model_dump(mode='json')}))
+    assert is_evaluated(evaluation)
+    assert not is_evaluated(evaluation.model_copy(update={'episodes': 2}))
+
+
+@pytest.mark.mujoco
+@pytest.mark.slow
+def test_interrupted_study_goes_on_and_evaluates_every_policy(preset, tmp_path):
+    values = yaml.safe_load(preset.read_text())
+    values['sweep'] |= {'seeds': [0], 'adaptations': {'ttt': {}}, 'curve': [], 'processes': 1}
+    del values['sweep']['arms']['one-step']
+    preset.write_text(yaml.safe_dump(values))
+    study = tmp_path / 'study'
+    command = [sys.executable, '-m', 'tools.sweep', '--preset', str(preset)]
+    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not (study / 'base-0' / 'checkpoint').exists():
+        assert process.poll() is None, f'ended with status {process.returncode}'
+        assert time.monotonic() < deadline, 'no checkpoint within two minutes'
+        time.sleep(0.05)
+    os.kill(process.pid, signal.SIGINT)
+    assert process.wait(60) == 130
+    assert not (study / 'evaluation-ttt.json').exists()
+
+    subprocess.run(command, cwd=ROOT, check=True)
+    results = json.loads((study / 'evaluation-ttt.json').read_text())['results']
+    evaluated = [Path(result['checkpoint']).parent.name for result in results]
+    assert evaluated == ['base-0', 'reptile-0']
+    assert [point['budget'] for point in results[1]['curve']] == [0, 1]

@@ -1,0 +1,98 @@
+"""What a long-running tool records: TensorBoard and `metrics.jsonl`."""
+
+from collections.abc import Mapping, Sequence
+import json
+from pathlib import Path
+import time
+from typing import Any, Self
+
+from metagcttt_core.files import atomic_write
+import numpy as np
+from torch.utils.tensorboard import SummaryWriter
+
+METRICS = 'metrics.jsonl'
+
+
+class RunLog:
+    """Numbers of a run, to TensorBoard and to the JSON-lines file `metrics.jsonl`.
+
+    Attributes:
+        records: The lines of the run so far, when it goes on.
+    """
+
+    def __init__(self, folder: Path, first_step: int) -> None:
+        """Open the logs in `folder`; lines of a resumed run beyond `first_step` are dropped."""
+        path = folder / METRICS
+        self.records: list[dict[str, Any]] = []
+        if first_step > 0 and path.exists():
+            self.records = [line for line in read_metrics(path) if line['step'] <= first_step]
+        with atomic_write(path) as file:
+            file.writelines((json.dumps(record) + '\n').encode() for record in self.records)
+        self._file = path.open('a', encoding='utf-8')
+        self._writer = SummaryWriter(str(folder / 'tensorboard'), purge_step=first_step)
+
+    def write(
+        self,
+        step: int,
+        scalars: Mapping[str, float | None],
+        *,
+        samples: Mapping[str, Sequence[float]] | None = None,
+        curves: Mapping[str, Sequence[float]] | None = None,
+        warnings: Sequence[str] = (),
+    ) -> None:
+        """Record a step.
+
+        Args:
+            step: Steps done.
+            scalars: Numbers by name; those that are None are left out.
+            samples: Values to see the distribution of, by name.
+            curves: Values in their order, by name; to the file only, with six digits.
+            warnings: What looks bad.
+        """
+        known = {name: value for name, value in scalars.items() if value is not None}
+        record = {'step': step, 'time': round(time.time(), 3), **known, **(samples or {})}
+        for name, values in (curves or {}).items():
+            record[name] = [float(f'{value:.6g}') for value in values]
+        if warnings:
+            record['warnings'] = list(warnings)
+        self._file.write(json.dumps(record) + '\n')
+        self._file.flush()
+        for name, value in known.items():
+            self._writer.add_scalar(name, value, step)
+        for name, values in (samples or {}).items():
+            self._writer.add_histogram(name, np.asarray(values), step)
+        for warning in warnings:
+            self._writer.add_text('warnings', warning, step)
+
+    def close(self) -> None:
+        """Flush and close."""
+        self._file.close()
+        self._writer.close()
+
+    def __enter__(self) -> Self:
+        """The log itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close."""
+        self.close()
+
+
+class SilentLog(RunLog):
+    """The log of a process that leaves writing to another."""
+
+    def __init__(self) -> None:
+        """Open nothing."""
+        self.records = []
+
+    def write(self, *_: Any, **__: Any) -> None:
+        """Record nothing."""
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """The lines of a `metrics.jsonl`, in order; a last one cut short by a crash is left out."""
+    *lines, _ = path.read_text(encoding='utf-8').split('\n')
+    return [json.loads(line) for line in lines]
