@@ -3,11 +3,13 @@
 from collections.abc import Callable, Iterator
 import os
 from pathlib import Path
+import threading
 
 # Before any message is imported: wrong types in fields are errors.
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 
 from domain_coordinator import domain_id
+from metagcttt import deployment
 from metagcttt_core import make_agent, save_checkpoint, TrajectoryDataset
 import pytest
 from tools.node_process import NodeProcess
@@ -92,3 +94,18 @@ def start_process(tmp_path: Path, ros_domain: int) -> Iterator[Callable[..., Nod
     for process in started:
         process.stop()
         print(process.describe('was stopped'))
+
+
+@pytest.fixture
+def slow_adaptation(monkeypatch: pytest.MonkeyPatch):
+    """Adaptations wait until the test lets them go on, or until they are cancelled."""
+    go_on = threading.Event()
+
+    def slow_adapt(*args, should_stop, **kwargs):
+        while not (go_on.wait(0.001) or should_stop()):
+            pass
+        return adapt(*args, should_stop=should_stop, **kwargs)
+
+    adapt = deployment.adapt
+    monkeypatch.setattr(deployment, 'adapt', slow_adapt)
+    return go_on

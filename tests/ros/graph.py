@@ -1,6 +1,7 @@
 """Nodes in one process, spun by the test until what it waits for has happened."""
 
 from collections.abc import Callable
+from itertools import groupby
 import time
 from typing import Any, TypeVar
 
@@ -26,6 +27,8 @@ EVERY = QoSProfile(
 )
 RELIABLE = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE)
 ANY = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+LAST_SPINS = 10
 
 AnyNode = TypeVar('AnyNode', bound=Node)
 
@@ -109,7 +112,9 @@ class Graph:
         return self.call(SetTask, 'set_task', request)
 
     def close(self) -> None:
-        """Destroy everything."""
+        """Destroy everything, after what was begun: rclpy gives results in tasks."""
+        for _ in range(LAST_SPINS):
+            self._executor.spin_once(timeout_sec=0)
         self._executor.shutdown()
         for node in self._nodes:
             node.destroy_node()
@@ -122,9 +127,14 @@ class Record:
     def __init__(self, graph: Graph, state_profile: QoSProfile = ANY) -> None:
         self.states: list[MazeState] = graph.collect(MazeState, 'state', state_profile)
         self.actions: list[ActionCommand] = graph.collect(ActionCommand, 'action', RELIABLE)
-        self.queries: list[GoalQuery] = graph.collect(GoalQuery, 'goal')
+        self._queries: list[GoalQuery] = graph.collect(GoalQuery, 'goal')
         self.events: list[EpisodeEvent] = graph.collect(EpisodeEvent, 'episode')
         self.reports: list[AdaptationReport] = graph.collect(AdaptationReport, 'adaptation')
+
+    @property
+    def queries(self) -> list[GoalQuery]:
+        """Goals as they were given; the goal node repeats the one in force."""
+        return [query for query, _ in groupby(self._queries)]
 
     def of_kind(self, kind: int) -> list[EpisodeEvent]:
         """Events of one kind."""

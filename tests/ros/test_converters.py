@@ -1,7 +1,7 @@
+from metagcttt.adaptation_report import report_message
 from metagcttt.converters import (
     action_message,
     occupancy_grid,
-    report_message,
     state_message,
     to_array,
     to_floats,

@@ -129,9 +129,7 @@ def test_reached_goal_is_switched_off(rig: Rig) -> None:
     assert (query.query_id, query.active) == (1, False)
 
 
-def test_tolerance_and_limit_are_parameters_that_apply_at_once(
-    graph: Graph, dataset_file: Path
-) -> None:
+def test_tolerance_limit_and_seed_are_parameters(graph: Graph, dataset_file: Path) -> None:
     rig = Rig(graph, dataset_file, goal_tolerance_m=0.1, max_steps=3, seed=9)
     rig.state()
     rig.send(4.0, 0.0)
@@ -177,6 +175,15 @@ def test_restarted_simulator_voids_the_goal(rig: Rig) -> None:
     rig.query(1)
     rig.started(1)
     assert not rig.query(2).active
+
+
+def test_older_episodes_that_are_heard_of_late_leave_the_goal(rig: Rig) -> None:
+    rig.state(episode_id=7)
+    rig.send(4.0, 0.0)
+    rig.query(1)
+    before = {'source_timestamp': rig.node._state_published_ns - 1}
+    rig.node._on_event(EpisodeEvent(kind=EpisodeEvent.STARTED, episode_id=1), before)
+    assert rig.node._goal is not None
 
 
 def test_task_goal_of_another_size_is_rejected(rig: Rig) -> None:

@@ -38,6 +38,17 @@ def test_pause_misses_no_deadline() -> None:
     assert deadlines.total == 0
 
 
+def test_steps_of_an_episode_without_an_action_are_missed() -> None:
+    deadlines = Deadlines()
+    for episode_id, step in [(1, 7), (1, 7), (1, 8), (1, 12), (1, 3), (2, 50), (2, 52)]:
+        deadlines.answered(0.0, episode_id, step)
+    assert deadlines.total == 3 + 1  # 9 to 11; 51
+    assert deadlines.in_last_minute(60.0) == 4
+    deadlines.pause()
+    deadlines.answered(0.0, 2, 99)
+    assert deadlines.total == 4
+
+
 def test_short_fault_is_remembered_for_a_while() -> None:
     faults = Faults()
     faults.note('malformed_states', 'nan', 5.0)

@@ -6,6 +6,7 @@ The wheels have neither, so this cannot start anything; with the real ones `ros2
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
+import re
 import runpy
 import sys
 from types import ModuleType
@@ -96,6 +97,8 @@ def launch(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Launched]:
             setattr(fake, name, type(name, (Recorder,), {}))
         monkeypatch.setitem(sys.modules, module, fake)
 
+    monkeypatch.delitem(sys.modules, 'metagcttt.launch_arguments', raising=False)
+
     def run(name: str) -> Launched:
         names = runpy.run_path(str(PACKAGE / 'launch' / f'{name}.launch.py'))
         [entities] = names['generate_launch_description']().args
@@ -141,9 +144,9 @@ def test_arguments_are_described_and_finite_ones_list_their_values(
 def test_every_configuration_that_is_used_is_declared(launch, file: str) -> None:
     text = (PACKAGE / 'launch' / f'{file}.launch.py').read_text(encoding='utf-8')
     launched = launch(file)
-    for line in text.splitlines():
-        if "LaunchConfiguration('" in line:
-            assert line.split("LaunchConfiguration('")[1].split("'")[0] in launched.arguments
+    used = re.findall(r"(?:LaunchConfiguration|text|flag)\('(\w+)'\)", text)
+    assert used
+    assert set(used) <= launched.arguments.keys()
 
 
 def test_one_robot_has_all_nodes_under_their_names(launch) -> None:

@@ -3,6 +3,7 @@ import os
 from pathlib import Path
 import signal
 import subprocess
+import sys
 import time
 
 from ament_index_python import get_package_prefix
@@ -67,6 +68,8 @@ def test_signal_ends_the_node_cleanly(
 ) -> None:
     process = start(node, '--ros-args', *arguments(node, checkpoint_folder, dataset_file))
     wait_for_node(graph, node)
+    if node == 'sim_bridge_node':  # has imported glfw, whose own script would speak up too
+        graph.wait(lambda: graph.node.count_publishers('state'), 'the simulator', timeout_s=60)
     os.killpg(process.pid, number)
     output, errors = process.communicate(timeout=20)
     assert (process.returncode, errors) == (0, ''), output
@@ -93,6 +96,23 @@ def catches(status: Path, number: int) -> bool:
     """Whether a process has a handler of its own for a signal, by its /proc/PID/status."""
     mask = next(line for line in status.read_text().splitlines() if line.startswith('SigCgt'))
     return bool(int(mask.split()[1], 16) >> (number - 1) & 1)
+
+
+@pytest.mark.slow
+def test_nodes_end_with_the_program_that_started_them(graph: Graph, tmp_path: Path) -> None:
+    program = f"""
+import pathlib, time
+from tools.node_process import NodeProcess
+NodeProcess('recorder_node', {{'output': '{tmp_path}/all.mcap'}}, pathlib.Path('{tmp_path}/log'))
+time.sleep(600)
+"""
+    owner = subprocess.Popen([sys.executable, '-c', program], cwd=Path(__file__).parents[2])
+    try:
+        wait_for_node(graph, 'recorder_node')
+    finally:
+        owner.kill()
+        owner.wait()
+    graph.wait(lambda: 'recorder_node' not in graph.node.get_node_names(), 'the end of the node')
 
 
 @pytest.mark.parametrize(

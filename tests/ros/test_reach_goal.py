@@ -1,69 +1,22 @@
-from collections.abc import Callable
 from pathlib import Path
 import re
-import signal
 
-from metagcttt.commander import NoAnswerError, RobotCommander
-from metagcttt.goal_node import GoalNode
 from metagcttt_interfaces.action import ReachGoal
-from metagcttt_interfaces.msg import EpisodeEvent, GoalQuery, MazeState, PolicyStatus
+from metagcttt_interfaces.msg import EpisodeEvent, PolicyStatus
 import pytest
-from tools.node_process import NodeProcess
 
-from tests.ros.graph import EVERY, goal_pose, Graph, Record
+from tests.ros.goal_rig import ALSO_FREE, FREE, GoalRig
+from tests.ros.graph import goal_pose, Graph
 
 Result = ReachGoal.Result
-FREE = (4.0, 0.0)
-ALSO_FREE = (0.0, 4.0)
-
-
-class Rig:
-    """A goal node and its client; the test plays the simulator and the policy."""
-
-    def __init__(self, graph: Graph, dataset: Path, **parameters) -> None:
-        self.graph = graph
-        self.node = graph.add(
-            GoalNode, **{'dataset': str(dataset), 'stepping': 'lockstep', **parameters}
-        )
-        self.record = Record(graph, EVERY)
-        self.commander = RobotCommander(context=graph.context, executor=graph._executor)
-        self._states = graph.node.create_publisher(MazeState, 'state', EVERY)
-        self._events = graph.node.create_publisher(EpisodeEvent, 'episode', EVERY)
-        self._policy = graph.node.create_publisher(PolicyStatus, 'policy_status', EVERY)
-        graph.wait(
-            lambda: (
-                self._states.get_subscription_count() == 2
-                and self._events.get_subscription_count() == 3
-                and self._policy.get_subscription_count() == 1
-            ),
-            'the goal node',
-        )
-
-    def state(self, x: float = 0.0, y: float = 0.0, step: int = 0, episode_id: int = 1, **flags):
-        message = MazeState(episode_id=episode_id, step=step, observation=[x, y], **flags)
-        message.position.x, message.position.y = x, y
-        known = len(self.record.states)
-        self._states.publish(message)
-        self.graph.wait(lambda: len(self.record.states) > known, 'the state')
-
-    def started(self, episode_id: int) -> None:
-        self._events.publish(EpisodeEvent(kind=EpisodeEvent.STARTED, episode_id=episode_id))
-
-    def policy(self, **fields) -> None:
-        self._policy.publish(PolicyStatus(**fields))
-
-    def error(self, sent) -> tuple[int, str]:
-        result = sent.result(10)
-        assert not result.success
-        return result.error_code, result.error_msg
 
 
 @pytest.fixture
 def make_rig(graph: Graph, dataset_file: Path):
     rigs = []
 
-    def make(**parameters) -> Rig:
-        rigs.append(Rig(graph, dataset_file, **parameters))
+    def make(**parameters) -> GoalRig:
+        rigs.append(GoalRig(graph, dataset_file, **parameters))
         return rigs[-1]
 
     yield make
@@ -72,11 +25,11 @@ def make_rig(graph: Graph, dataset_file: Path):
 
 
 @pytest.fixture
-def rig(make_rig) -> Rig:
+def rig(make_rig) -> GoalRig:
     return make_rig()
 
 
-def test_goal_is_reached(rig: Rig) -> None:
+def test_goal_is_reached(rig: GoalRig) -> None:
     rig.state(step=7)
     sent = rig.commander.send(FREE)
     assert sent.accepted
@@ -90,7 +43,7 @@ def test_goal_is_reached(rig: Rig) -> None:
     assert [query.active for query in rig.record.queries] == [True, False]
 
 
-def test_full_goal_observation_is_taken_as_it_is(rig: Rig) -> None:
+def test_full_goal_observation_is_taken_as_it_is(rig: GoalRig) -> None:
     rig.state()
     request = ReachGoal.Goal(goal=[4.25, 0.5], request_id='mine')
     assert rig.commander.send_request(request).accepted
@@ -100,7 +53,7 @@ def test_full_goal_observation_is_taken_as_it_is(rig: Rig) -> None:
     assert accepted[0].request_id == 'mine'
 
 
-def test_feedback_has_phase_distance_and_gradient_steps(rig: Rig) -> None:
+def test_feedback_has_phase_distance_and_gradient_steps(rig: GoalRig) -> None:
     rig.state(step=3)
     sent = rig.commander.send(FREE)
     rig.state(x=1.0, step=4)
@@ -129,7 +82,7 @@ def test_feedback_has_phase_distance_and_gradient_steps(rig: Rig) -> None:
     ],
 )
 def test_goal_is_refused_with_code_and_reason(
-    rig: Rig, request_: dict, code: int, reason: str
+    rig: GoalRig, request_: dict, code: int, reason: str
 ) -> None:
     rig.state()
     sent = rig.commander.send_request(ReachGoal.Goal(request_id='x', **request_))
@@ -140,11 +93,11 @@ def test_goal_is_refused_with_code_and_reason(
     assert rig.record.queries == []
 
 
-def test_goal_before_the_first_state_is_refused(rig: Rig) -> None:
+def test_goal_before_the_first_state_is_refused(rig: GoalRig) -> None:
     assert rig.error(rig.commander.send(FREE))[0] == Result.NO_STATE
 
 
-def test_goal_after_the_episode_is_refused(rig: Rig) -> None:
+def test_goal_after_the_episode_is_refused(rig: GoalRig) -> None:
     rig.state(truncated=True)
     assert rig.error(rig.commander.send(FREE))[0] == Result.EPISODE_OVER
 
@@ -152,7 +105,7 @@ def test_goal_after_the_episode_is_refused(rig: Rig) -> None:
 # --- endings ------------------------------------------------------------------------------------
 
 
-def test_newer_action_goal_preempts(rig: Rig) -> None:
+def test_newer_action_goal_preempts(rig: GoalRig) -> None:
     rig.state()
     first = rig.commander.send(FREE)
     second = rig.commander.send(ALSO_FREE)
@@ -164,14 +117,14 @@ def test_newer_action_goal_preempts(rig: Rig) -> None:
     assert (ended.query_id, ended.error_code) == (1, Result.PREEMPTED)
 
 
-def test_goal_pose_preempts(rig: Rig) -> None:
+def test_goal_pose_preempts(rig: GoalRig) -> None:
     rig.state()
     sent = rig.commander.send(FREE)
     rig.graph.publish('goal_pose', goal_pose(*ALSO_FREE))
     assert rig.error(sent)[0] == Result.PREEMPTED
 
 
-def test_refused_goal_leaves_the_one_under_way(rig: Rig) -> None:
+def test_refused_goal_leaves_the_one_under_way(rig: GoalRig) -> None:
     rig.state()
     sent = rig.commander.send(FREE)
     assert not rig.commander.send((8.0, 0.0)).accepted
@@ -179,7 +132,7 @@ def test_refused_goal_leaves_the_one_under_way(rig: Rig) -> None:
     assert sent.result().success
 
 
-def test_canceled_goal_stops_the_policy(rig: Rig) -> None:
+def test_canceled_goal_stops_the_policy(rig: GoalRig) -> None:
     rig.state()
     sent = rig.commander.send(FREE)
     assert sent.cancel()
@@ -189,7 +142,7 @@ def test_canceled_goal_stops_the_policy(rig: Rig) -> None:
     assert not sent.cancel()
 
 
-def test_steps_of_the_goal_run_out(rig: Rig) -> None:
+def test_steps_of_the_goal_run_out(rig: GoalRig) -> None:
     rig.state()
     sent = rig.commander.send(FREE, max_steps=2)
     for step in (1, 2):
@@ -199,7 +152,7 @@ def test_steps_of_the_goal_run_out(rig: Rig) -> None:
     assert sent.result().steps == 2
 
 
-def test_episode_ends_under_way(rig: Rig) -> None:
+def test_episode_ends_under_way(rig: GoalRig) -> None:
     rig.state()
     sent = rig.commander.send(FREE)
     rig.state(step=1, truncated=True)
@@ -207,14 +160,14 @@ def test_episode_ends_under_way(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize('by', ['state', 'started'])
-def test_new_episode_ends_the_goal(rig: Rig, by: str) -> None:
+def test_new_episode_ends_the_goal(rig: GoalRig, by: str) -> None:
     rig.state()
     sent = rig.commander.send(FREE)
     getattr(rig, by)(episode_id=2)
     assert rig.error(sent) == (Result.NEW_EPISODE, 'episode 2 began')
 
 
-def test_goal_sent_right_after_a_reset_belongs_to_the_new_episode(rig: Rig) -> None:
+def test_goal_sent_right_after_a_reset_belongs_to_the_new_episode(rig: GoalRig) -> None:
     rig.state(step=9)
     rig.started(2)
     rig.graph.wait(lambda: rig.record.of_kind(EpisodeEvent.STARTED), 'the event')
@@ -225,7 +178,7 @@ def test_goal_sent_right_after_a_reset_belongs_to_the_new_episode(rig: Rig) -> N
     assert rig.record.queries[0].episode_id == 2
 
 
-def test_goal_waits_for_its_episode_and_refuses_one_that_is_over(rig: Rig) -> None:
+def test_goal_waits_for_its_episode_and_refuses_one_that_is_over(rig: GoalRig) -> None:
     rig.state(step=9, episode_id=2, terminated=True)
     old = ReachGoal.Goal(pose=goal_pose(*FREE), episode_id=1, request_id='old')
     assert rig.error(rig.commander.send_request(old)) == (
@@ -263,7 +216,7 @@ def test_vanished_simulator_ends_the_goal_in_lockstep(make_rig) -> None:
     assert rig.error(sent)[0] == Result.STATE_LOST
 
 
-def test_goal_node_that_goes_down_ends_the_goal(rig: Rig) -> None:
+def test_goal_node_that_goes_down_ends_the_goal(rig: GoalRig) -> None:
     rig.state()
     sent = rig.commander.send(FREE)
     rig.node.end_service()
@@ -280,55 +233,3 @@ def test_every_error_code_is_provoked_here() -> None:
     named = re.findall(r'^uint16 (\w+)=', definition.read_text(encoding='utf-8'), re.MULTILINE)
     assert len(named) == 15
     assert [name for name in named if f'Result.{name}' not in source] == []
-
-
-# --- the client ---------------------------------------------------------------------------------
-
-
-def test_blocking_call_cancels_what_takes_too_long(rig: Rig) -> None:
-    rig.state()
-    with pytest.raises(NoAnswerError, match=r'no answer within 0\.5 s: the goal'):
-        rig.commander.reach(FREE, timeout_s=0.5)
-    rig.graph.wait(lambda: len(rig.record.queries) == 2, 'the stop')
-
-
-def test_absent_robot_is_an_error(graph: Graph) -> None:
-    commander = RobotCommander(context=graph.context)
-    with pytest.raises(NoAnswerError, match='action reach_goal'):
-        commander.reach(FREE, timeout_s=0.2)
-    with pytest.raises(NoAnswerError, match=r'service .*set_task'):
-        commander.set_task(1, timeout_s=0.2)
-    commander.destroy_node()
-
-
-@pytest.mark.slow
-def test_processes_drive_to_a_goal_and_end_it_when_they_go_down(
-    graph: Graph,
-    start_process: Callable[..., NodeProcess],
-    dataset_file: Path,
-    checkpoint_folder: Path,
-) -> None:
-    start_process('sim_bridge_node', stepping='lockstep')
-    goals = start_process('goal_node', dataset=dataset_file, stepping='lockstep')
-    start_process(
-        'policy_node',
-        dataset=dataset_file,
-        checkpoint=checkpoint_folder,
-        stepping='lockstep',
-        adaptation='hold',
-        adapt_steps=5,
-    )
-    commander = RobotCommander(context=graph.context, executor=graph._executor)
-    queries = graph.collect(GoalQuery, 'goal')
-    task = commander.set_task(1, timeout_s=60)
-    goal = (task.goal_position.x, task.goal_position.y)
-    result = commander.reach(goal, max_steps=20)
-    assert (result.success, result.error_code) == (False, Result.TIMED_OUT)
-    assert result.steps == 20
-    commander.set_task(1)
-    sent = commander.send(goal)
-    graph.wait(lambda: sent.feedback and sent.feedback.adapted, 'the expert')
-    assert goals.stop(signal_number=signal.SIGTERM) == 0
-    assert sent.result(5).error_code == Result.SHUTDOWN
-    assert not queries[-1].active
-    commander.destroy_node()

@@ -8,6 +8,7 @@ from metagcttt_interfaces.msg import AdaptationReport, GoalQuery, MazeState
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
 import pytest
+from rclpy.parameter import Parameter
 from visualization_msgs.msg import Marker, MarkerArray
 import yaml
 
@@ -68,7 +69,7 @@ def test_markers_show_what_was_retrieved_until_the_goal_is_over(
     graph: Graph, critic_folder, dataset_file
 ) -> None:
     files = {'checkpoint': str(critic_folder), 'dataset': str(dataset_file)}
-    graph.add(VisualizationNode, rate_hz=20.0, **files)
+    node = graph.add(VisualizationNode, rate_hz=20.0, **files)
     arrays = graph.collect(MarkerArray, 'markers')
     send(graph, state(0))
     goal = GoalQuery(query_id=1, episode_id=1, active=True, goal=[4.0, 0.0])
@@ -84,6 +85,10 @@ def test_markers_show_what_was_retrieved_until_the_goal_is_over(
     assert (lines.points[0].x, lines.points[0].y) == tuple(rows[0].tolist())
     assert (disc.action, disc.pose.position.x) == (Marker.ADD, 4.0)
     assert text.text.startswith('V = ')
+    node.set_parameters([Parameter('marker_points', value=6)])
+    report.best_step = 1  # another report
+    graph.publish('adaptation', report, EVERY)
+    graph.wait(lambda: 0 < len(arrays[-1].markers[0].points) < 2 * 2 * 9, 'fewer points')
     goal.active = False
     graph.publish('goal', goal, EVERY)
     graph.wait(lambda: {m.action for m in arrays[-1].markers} == {Marker.DELETE}, 'the end')

@@ -5,7 +5,6 @@ Where the policy cannot be configured, everything is shut down.
 
 from launch import LaunchDescription
 from launch.actions import (
-    DeclareLaunchArgument,
     EmitEvent,
     IncludeLaunchDescription,
     RegisterEventHandler,
@@ -17,43 +16,10 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import LifecycleNode
 from launch_ros.event_handlers import OnStateTransition
 from launch_ros.events.lifecycle import ChangeState
-from launch_ros.parameter_descriptions import ParameterValue
-from launch_ros.substitutions import FindPackageShare
 from lifecycle_msgs.msg import Transition
+from metagcttt.launch_arguments import declare, SHARE, text
 
-SHARE = FindPackageShare('metagcttt')
-
-ARGUMENTS = (
-    DeclareLaunchArgument(
-        'namespace', default_value='', description='namespace of the whole robot'
-    ),
-    DeclareLaunchArgument(
-        'stepping',
-        default_value='realtime',
-        choices=['realtime', 'lockstep'],
-        description='whether the world goes on by itself or waits for every action; '
-        'chooses the parameter file',
-    ),
-    DeclareLaunchArgument(
-        'params_file',
-        default_value=[
-            PathJoinSubstitution([SHARE, 'config', LaunchConfiguration('stepping')]),
-            '.yaml',
-        ],
-        description='parameter file of the nodes, instead of the one for `stepping`',
-    ),
-    DeclareLaunchArgument(
-        'checkpoint', default_value='', description='folder of the policy; empty: committed one'
-    ),
-    DeclareLaunchArgument(
-        'dataset', default_value='', description='dataset file (.npz); empty: committed one'
-    ),
-)
-
-
-def text(argument: str) -> ParameterValue:
-    """A launch argument as a string parameter."""
-    return ParameterValue(LaunchConfiguration(argument), value_type=str)
+ARGUMENTS = ('namespace', 'stepping', 'params_file', 'checkpoint', 'dataset')
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -84,7 +50,7 @@ def generate_launch_description() -> LaunchDescription:
 
     return LaunchDescription(
         [
-            *ARGUMENTS,
+            *declare(*ARGUMENTS),
             IncludeLaunchDescription(
                 PythonLaunchDescriptionSource(
                     PathJoinSubstitution([SHARE, 'launch', 'metagcttt.launch.py'])

@@ -10,55 +10,24 @@ from launch.substitutions import (
     PathJoinSubstitution,
 )
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
-from launch_ros.substitutions import FindPackageShare
+from metagcttt.launch_arguments import declare, SHARE, text
 
 ROBOTS = ('robot1', 'robot2')
 SHARED = ('stepping', 'environment', 'visualize', 'log_level')
 
-ARGUMENTS = (
+CHECKPOINTS = [
     DeclareLaunchArgument(
-        'stepping',
-        default_value='realtime',
-        choices=['realtime', 'lockstep'],
-        description='whether the worlds go on by themselves or wait for every action',
-    ),
-    DeclareLaunchArgument(
-        'environment',
-        default_value='pointmaze-medium-v0',
-        description='name of both mazes, as sim_bridge knows it',
-    ),
-    *(
-        DeclareLaunchArgument(
-            f'{robot}_checkpoint',
-            default_value='',
-            description=f'folder of the policy of {robot}; empty: committed one',
-        )
-        for robot in ROBOTS
-    ),
-    DeclareLaunchArgument(
-        'record', default_value='', description='file (.mcap) to record both to; empty: none'
-    ),
-    DeclareLaunchArgument(
-        'visualize',
-        default_value='false',
-        choices=['true', 'false'],
-        description='whether to publish odom, path and markers of both',
-    ),
-    DeclareLaunchArgument(
-        'log_level',
-        default_value='info',
-        choices=['debug', 'info', 'warn', 'error', 'fatal'],
-        description='log level of the nodes',
-    ),
-)
+        f'{robot}_checkpoint',
+        default_value='',
+        description=f'folder of the policy of {robot}; empty: committed one',
+    )
+    for robot in ROBOTS
+]
 
 
 def robot_group(robot: str) -> GroupAction:
     """One robot; the group keeps its arguments from the other."""
-    one_robot = PathJoinSubstitution(
-        [FindPackageShare('metagcttt'), 'launch', 'metagcttt.launch.py']
-    )
+    one_robot = PathJoinSubstitution([SHARE, 'launch', 'metagcttt.launch.py'])
     arguments = {name: LaunchConfiguration(name) for name in SHARED}
     arguments['namespace'] = robot
     arguments['clock_topic'] = 'clock'
@@ -78,14 +47,15 @@ def generate_launch_description() -> LaunchDescription:
     record = LaunchConfiguration('record')
     return LaunchDescription(
         [
-            *ARGUMENTS,
+            *declare(*SHARED, 'record'),
+            *CHECKPOINTS,
             *(robot_group(robot) for robot in ROBOTS),
             Node(
                 package='metagcttt',
                 executable='recorder_node',
                 name='recorder_node',
                 output='screen',
-                parameters=[{'output': ParameterValue(record, value_type=str)}],
+                parameters=[{'output': text('record')}],
                 condition=IfCondition(NotEqualsSubstitution(record, '')),
             ),
         ]

@@ -22,9 +22,15 @@ from std_srvs.srv import SetBool, Trigger
 from metagcttt.converters import to_floats, to_point
 from metagcttt.qos import EVENTS
 
+SILENT_S = 3.0  # the goal node sends feedback ten times a second
+
 
 class NoAnswerError(RuntimeError):
     """The graph did not answer in time."""
+
+
+class GoalLostError(NoAnswerError):
+    """The goal node fell silent, and what it knew is lost."""
 
 
 @dataclass(frozen=True)
@@ -106,10 +112,13 @@ class RobotCommander(Node):
 
         Raises:
             NoAnswerError: If it takes longer.
+            GoalLostError: If the goal node falls silent.
         """
         sent = self.send(goal, max_steps=max_steps, timeout_s=timeout_s)
         try:
             return sent.result(timeout_s)
+        except GoalLostError:
+            raise
         except NoAnswerError:
             sent.cancel()
             raise
@@ -188,7 +197,11 @@ class RobotCommander(Node):
     def _call(self, client: Client, request: Any, timeout_s: float) -> Any:
         self.wait(client.service_is_ready, f'service {client.srv_name}', timeout_s)
         future = client.call_async(request)
-        self.wait(future.done, f'the answer of {client.srv_name}', timeout_s)
+        try:
+            self.wait(future.done, f'the answer of {client.srv_name}', timeout_s)
+        except NoAnswerError:
+            client.remove_pending_request(future)
+            raise
         return future.result()
 
     # --- waiting -----------------------------------------------------------------------------
@@ -228,6 +241,7 @@ class SentGoal:
         """Nothing is known yet."""
         self.feedback: ReachGoal.Feedback | None = None
         self._commander = commander
+        self._heard_s = self._looked_s = float('-inf')
         self._handle: ClientGoalHandle | None = None
         self._answer: Future | None = None
         self._result: ReachResult | None = None
@@ -238,18 +252,23 @@ class SentGoal:
         return self._handle is not None
 
     def is_done(self) -> bool:
-        """Whether the result is known; takes in waiting messages first."""
+        """Whether the result is known; takes in waiting messages first.
+
+        Raises:
+            GoalLostError: If the goal node has fallen silent.
+        """
         if self._result is None:
             self._commander.take_in()
-        return self._result is not None
+        return self._is_known()
 
     def result(self, timeout_s: float = 60.0) -> ReachResult:
         """Wait for the result.
 
         Raises:
             NoAnswerError: If there is none within `timeout_s`.
+            GoalLostError: If the goal node falls silent.
         """
-        self._commander.wait(lambda: self._result is not None, 'the goal', timeout_s)
+        self._commander.wait(self._is_known, 'the goal', timeout_s)
         assert self._result is not None
         return self._result
 
@@ -264,6 +283,7 @@ class SentGoal:
     def on_feedback(self, message: Any) -> None:
         """Called with every feedback message."""
         self.feedback = message.feedback
+        self._heard_s = time.monotonic()
 
     def begin(self, handle: ClientGoalHandle) -> None:
         """The goal was taken."""
@@ -274,6 +294,18 @@ class SentGoal:
     def refuse(self, result: ReachResult) -> None:
         """The goal was refused."""
         self._result = result
+
+    def _is_known(self) -> bool:
+        """Whether the result is known; an error when the goal node is no longer to be heard."""
+        now_s = time.monotonic()
+        if now_s - self._looked_s > SILENT_S / 2:
+            self._heard_s = now_s  # nobody has taken in what it said meanwhile
+        self._looked_s = now_s
+        if self._result is None and now_s - self._heard_s > SILENT_S:
+            raise GoalLostError(
+                f'no feedback for {SILENT_S:g} s: the goal node is gone, and the goal with it'
+            )
+        return self._result is not None
 
     def _on_result(self, future: Future) -> None:
         result = future.result().result

@@ -6,9 +6,8 @@ import math
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point
-from metagcttt_core import Adaptation, SupportSet
 from metagcttt_interfaces.action import ReachGoal
-from metagcttt_interfaces.msg import ActionCommand, AdaptationReport, MazeState, PolicyStatus
+from metagcttt_interfaces.msg import ActionCommand, MazeState, PolicyStatus
 from nav_msgs.msg import OccupancyGrid
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -70,7 +69,14 @@ def state_message(
 
 
 def action_message(
-    stamp: Time, *, episode_id: int, step: int, query_id: int, values: ArrayLike, adapted: bool
+    stamp: Time,
+    *,
+    episode_id: int,
+    step: int,
+    query_id: int,
+    values: ArrayLike,
+    adapted: bool,
+    instance: int = 0,
 ) -> ActionCommand:
     """The answer of the policy to one state."""
     return ActionCommand(
@@ -80,50 +86,8 @@ def action_message(
         query_id=query_id,
         values=to_floats(values),
         adapted=bool(adapted),
+        instance=instance,
     )
-
-
-def report_message(
-    stamp: Time,
-    *,
-    query_id: int,
-    episode_id: int,
-    support: SupportSet | None,
-    adaptation: Adaptation | None,
-    reason: str = '',
-    cached: bool = False,
-) -> AdaptationReport:
-    """What became of one query.
-
-    Args:
-        stamp: Time of the report.
-        query_id: The query.
-        episode_id: Its episode.
-        support: What the filter found; None when it did not run.
-        adaptation: What the inner loop made of it; None when it did not end.
-        reason: Why there is no adaptation; otherwise the adaptation's own reason is taken.
-        cached: The adaptation was made for an earlier query; no time was spent on this one.
-    """
-    message = AdaptationReport(
-        header=Header(stamp=stamp), query_id=query_id, episode_id=episode_id, reason=reason
-    )
-    if support is not None:
-        message.relevant_trajectories = int(support.num_relevant)
-        message.kept_trajectories = int(support.num_kept)
-        message.transitions = int(support.num_transitions)
-        message.filter_ms = 0.0 if cached else float(support.milliseconds)
-        message.segment_starts = [int(start) for start, _ in support.segments]
-        message.segment_stops = [int(stop) for _, stop in support.segments]
-    if adaptation is not None:
-        message.adapt_ms = 0.0 if cached else 1000.0 * adaptation.seconds
-        message.cached = cached
-        message.steps = len(adaptation.train_losses)
-        message.train_losses = to_floats(adaptation.train_losses)
-        message.test_losses = to_floats(adaptation.test_losses)
-        message.best_step = int(adaptation.best_step)
-        message.accepted = bool(adaptation.accepted)
-        message.reason = adaptation.reason
-    return message
 
 
 def feedback_message(goal: Goal, state: MazeState, policy: PolicyStatus) -> ReachGoal.Feedback:

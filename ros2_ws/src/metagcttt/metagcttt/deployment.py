@@ -1,9 +1,8 @@
 """What a deployed policy consists of, and how it answers a query. No ROS in here."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import count
-from pathlib import Path
 
 from metagcttt_core import (
     adapt,
@@ -16,11 +15,12 @@ from metagcttt_core import (
     TrajectoryFilter,
     TTTConfig,
 )
-from metagcttt_core.config.assets import assets_dir
+from metagcttt_core.adaptation import AdaptationCancelled
+from metagcttt_core.retrieval.value_cache import ValueFunction
 import numpy as np
 from numpy.typing import NDArray
 
-ASSETS = 'pointmaze-medium-navigate'
+from metagcttt.assets import checkpoint_path, dataset_path
 
 
 @dataclass(frozen=True)
@@ -44,14 +44,20 @@ class Outcome:
     adaptation: Adaptation
 
 
-def checkpoint_path(path: str) -> Path:
-    """`path`, or the committed post-trained policy when it is empty."""
-    return Path(path).expanduser() if path else assets_dir() / ASSETS / 'meta'
+@dataclass(frozen=True)
+class _StoppableValue:
+    """A critic whose evaluation, which takes seconds for a large dataset, can be given up.
 
+    Equal to that of another query when the critic is, so that values are remembered.
+    """
 
-def dataset_path(path: str) -> Path:
-    """`path`, or the committed dataset when it is empty."""
-    return Path(path).expanduser() if path else assets_dir() / ASSETS / 'dataset.npz'
+    value_fn: ValueFunction
+    should_stop: Callable[[], bool] = field(compare=False)
+
+    def __call__(self, observations: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        if self.should_stop():
+            raise AdaptationCancelled('cancelled while the critic was evaluated')
+        return self.value_fn(observations, goal)
 
 
 def load_deployment(checkpoint: str, dataset: str, config: FilterConfig) -> Deployment:
@@ -95,7 +101,7 @@ def answer_query(
         goal: Goal observation, shape (obs_dim,).
         config: Inner loop; 0 steps ask for the base policy.
         seed: Of everything random in the inner loop.
-        should_stop: Asked before every step.
+        should_stop: Asked before every step, and between evaluations of the critic.
         on_step: Called before every step with the number of steps done.
 
     Raises:
@@ -113,7 +119,8 @@ def answer_query(
             on_step(next(steps_done))
         return stop
 
-    support = trajectory_filter.query(observation, goal, agent.value_fn)
+    value_fn = agent.value_fn and _StoppableValue(agent.value_fn, should_stop)
+    support = trajectory_filter.query(observation, goal, value_fn)
     return Outcome(
         support,
         adapt(
@@ -126,3 +133,19 @@ def answer_query(
             should_stop=stop_or_go_on,
         ),
     )
+
+
+def foresee_values(
+    deployment: Deployment, goal: NDArray[np.float64], should_stop: Callable[[], bool]
+) -> None:
+    """Evaluate the critic towards `goal` everywhere, so that the next query of it is quick.
+
+    Args:
+        deployment: Policy and dataset; the policy has a critic.
+        goal: Goal observation, shape (obs_dim,).
+        should_stop: Asked now and then.
+    """
+    value_fn = deployment.agent.value_fn
+    assert value_fn is not None, 'policies without a critic have nothing to foresee'
+    remembered = _StoppableValue(value_fn, should_stop=lambda: False)
+    deployment.trajectory_filter.prefetch_values(remembered, goal, should_stop)

@@ -1,5 +1,7 @@
 """What the goal node publishes and logs about goals."""
 
+import time
+
 from metagcttt_interfaces.action import ReachGoal
 from metagcttt_interfaces.msg import EpisodeEvent, GoalQuery, MazeState
 from rclpy.node import Node
@@ -15,6 +17,7 @@ ENDINGS = {
     'EPISODE_ENDED': (EpisodeEvent.TIMED_OUT, 'timed out'),
 }
 ENDED = (EpisodeEvent.ENDED, 'ended')
+REPEATS_PER_LEASE = 4
 
 
 class GoalAnnouncer:
@@ -29,22 +32,40 @@ class GoalAnnouncer:
         """
         self._node = node
         self._frame_id = frame_id
+        self._query = GoalQuery()
+        self._query_s = 0.0
         self._queries = node.create_publisher(GoalQuery, 'goal', LATCHED)
         self._events = node.create_publisher(EpisodeEvent, 'episode', EVENTS)
 
-    def query(self, goal: Goal, *, active: bool) -> None:
-        """Tell the policy to act on a goal, or that it is over."""
-        self._queries.publish(
-            GoalQuery(
-                header=self._header(),
-                query_id=goal.query_id,
-                episode_id=goal.episode_id,
-                active=active,
-                goal=to_floats(goal.observation),
-                position=to_point(goal.xy),
-                seed=goal.seed,
-            )
+    def query(self, goal: Goal, *, active: bool, lease_s: float = 0.0) -> None:
+        """Tell the policy to act on a goal, or that it is over.
+
+        Args:
+            goal: The goal.
+            active: Whether to act on it.
+            lease_s: Seconds after which the policy drops a goal that is not kept up; 0: never.
+        """
+        self._query = GoalQuery(
+            header=self._header(),
+            query_id=goal.query_id,
+            episode_id=goal.episode_id,
+            active=active,
+            goal=to_floats(goal.observation),
+            position=to_point(goal.xy),
+            seed=goal.seed,
+            lease_s=lease_s,
         )
+        self._publish_query(time.monotonic())
+
+    def keep_up(self, now_s: float) -> None:
+        """Repeat the newest query when it is time to; it goes out as it was."""
+        lease_s = self._query.lease_s
+        if lease_s > 0 and now_s - self._query_s >= lease_s / REPEATS_PER_LEASE:
+            self._publish_query(now_s)
+
+    def _publish_query(self, now_s: float) -> None:
+        self._query_s = now_s
+        self._queries.publish(self._query)
 
     def accepted(self, goal: Goal) -> None:
         """A goal was numbered."""

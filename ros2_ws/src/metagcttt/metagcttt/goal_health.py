@@ -6,8 +6,6 @@ import time
 from metagcttt.goals import Goal
 from metagcttt.health import Faults, Health, Level, Rate
 
-POLICY_SILENT_S = 2.0
-
 
 class GoalMonitor:
     """Gathers figures while goals come and go, and judges them.
@@ -34,8 +32,14 @@ class GoalMonitor:
         """The policy said that it is there."""
         self._policy_s = time.monotonic()
 
-    def examine(self, goal: Goal | None, *, has_source: bool) -> Health:
-        """The health now, with the goal in force and whether anybody publishes states."""
+    def examine(self, goal: Goal | None, *, has_source: bool, policy_timeout_s: float) -> Health:
+        """The health now.
+
+        Args:
+            goal: The goal in force, if any.
+            has_source: Whether anybody publishes states.
+            policy_timeout_s: How long a policy may be silent while there is a goal, seconds.
+        """
         now_s = time.monotonic()
         values = {
             'state_rate_hz': f'{self._states.per_second(now_s):.1f}',
@@ -48,6 +52,6 @@ class GoalMonitor:
             level, message = Level.ERROR, 'nobody publishes states'
         elif recent := self._faults.recent(now_s):
             level, message = Level.ERROR, f'a state was ignored: {recent}'
-        elif goal and now_s - self._policy_s > POLICY_SILENT_S:
+        elif goal and now_s - self._policy_s > policy_timeout_s:
             level, message = Level.WARN, 'a goal is in force, but no policy is to be heard'
         return Health(level, message, values)

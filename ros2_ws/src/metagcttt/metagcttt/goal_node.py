@@ -13,8 +13,8 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sim_bridge import describe_environment
 
+from metagcttt.assets import dataset_path
 from metagcttt.converters import feedback_message, to_array
-from metagcttt.deployment import dataset_path
 from metagcttt.diagnostics import Diagnostics
 from metagcttt.goal_announcer import GoalAnnouncer
 from metagcttt.goal_health import GoalMonitor
@@ -54,7 +54,8 @@ class GoalNode(Node):
         dataset = TrajectoryDataset.load(dataset_path(self._settings['dataset']))
         self._catalog = GoalCatalog(description, TrajectoryFilter(dataset))
         self._state: MazeState | None = None
-        self._state_time = self.get_clock().now()
+        self._state_published_ns = 0
+        self._note_time()
         self._source_seen_s = time.monotonic()
         self._order = StateOrder()
         self._monitor = GoalMonitor()
@@ -64,9 +65,19 @@ class GoalNode(Node):
 
         self._say = GoalAnnouncer(self, self._settings['frame_id'])
         profile = state_profile(self._settings['stepping'])
-        self.create_subscription(MazeState, 'state', self._on_state, profile)
+        self.create_subscription(
+            MazeState,
+            'state',
+            self._on_state,  # type: ignore[arg-type] # rclpy gives it the info as well
+            profile,
+        )
         self.create_subscription(PoseStamped, 'goal_pose', self._on_goal_pose, COMMAND)
-        self.create_subscription(EpisodeEvent, 'episode', self._on_event, EVENTS)
+        self.create_subscription(
+            EpisodeEvent,
+            'episode',
+            self._on_event,  # type: ignore[arg-type] # here too
+            EVENTS,
+        )
         self.create_subscription(PolicyStatus, 'policy_status', self._on_policy, LATCHED)
         self._reach_goal = ReachGoalServer(
             self,
@@ -145,9 +156,13 @@ class GoalNode(Node):
             request_id=request.request_id,
         )
 
-    def _on_event(self, message: EpisodeEvent) -> None:
+    def _on_event(self, message: EpisodeEvent, info: dict[str, int]) -> None:
         if message.kind != EpisodeEvent.STARTED:
             return
+        if self._state is not None and message.episode_id < self._state.episode_id:
+            # Not of a simulator that began anew, but what this one said before: it is latched.
+            if info['source_timestamp'] < self._state_published_ns:
+                return
         self._void_unless(message.episode_id)
         self._order = StateOrder()
         self._expect_episode(message.episode_id)
@@ -171,6 +186,12 @@ class GoalNode(Node):
         if episode_id > (self._state.episode_id if self._state else 0):
             self._void_unless(episode_id)
             self._state = MazeState(episode_id=episode_id)
+            self._note_time()
+
+    def _note_time(self) -> None:
+        """Begin to wait for the next state, by both clocks: the node's may stand still."""
+        self._state_time = self.get_clock().now()
+        self._state_time_s = time.monotonic()
 
     def _accept(
         self,
@@ -198,12 +219,12 @@ class GoalNode(Node):
             request_id=request_id,
             accepted_ns=self.get_clock().now().nanoseconds,
         )
-        self._say.query(self._goal, active=True)
+        self._say.query(self._goal, active=True, lease_s=self._settings['goal_lease_s'])
         self._say.accepted(self._goal)
 
     # --- goals go on and end -----------------------------------------------------------------
 
-    def _on_state(self, message: MazeState) -> None:
+    def _on_state(self, message: MazeState, info: dict[str, int]) -> None:
         xy = (message.position.x, message.position.y)
         fault = vector_fault('the state', to_array(message.observation), self._spec.obs_dim)
         fault = fault or vector_fault("the state's position", np.array(xy), 2)
@@ -215,7 +236,8 @@ class GoalNode(Node):
         if self._goal is not None and message.episode_id < self._goal.episode_id:
             return  # the goal's own episode is on the way
         self._state = message
-        self._state_time = self.get_clock().now()
+        self._state_published_ns = info['source_timestamp']
+        self._note_time()
         if self._goal is not None and message.episode_id > self._goal.episode_id:
             self._void_unless(message.episode_id)
         if self._goal is None or message.episode_id != self._goal.episode_id:
@@ -246,8 +268,14 @@ class GoalNode(Node):
             self._reach_goal.report(feedback_message(self._goal, self._state, self._policy))
 
     def _watch(self) -> None:
-        """Give a goal up when the simulator is silent; in lockstep, when it is gone."""
+        """Keep the goal in force up; give it up when the simulator is silent.
+
+        In lockstep the simulator may be silent for long, so there it is given up when it is gone.
+        """
         now_s = time.monotonic()
+        if self._goal is not None:
+            self._say.keep_up(now_s)
+            self._report_progress()
         awaited = (
             self._goal is not None and self._state is not None and not self._state.observation
         )
@@ -256,7 +284,7 @@ class GoalNode(Node):
         age_s = now_s - self._source_seen_s
         if self._settings['stepping'] == 'realtime':
             silence = self.get_clock().now() - self._state_time
-            age_s = max(age_s, silence.nanoseconds / 1e9)
+            age_s = max(age_s, silence.nanoseconds / 1e9, now_s - self._state_time_s)
         if self._goal is not None and age_s > self._settings['state_timeout_s']:
             reason = f'no state of episode {self._goal.episode_id} for {age_s:.1f} s'
             self._end(Verdict('STATE_LOST', reason))
@@ -282,4 +310,8 @@ class GoalNode(Node):
         self._reach_goal.finish(verdict, step - goal.first_step, seconds)
 
     def _examine(self) -> Health:
-        return self._monitor.examine(self._goal, has_source=bool(self.count_publishers('state')))
+        return self._monitor.examine(
+            self._goal,
+            has_source=bool(self.count_publishers('state')),
+            policy_timeout_s=self._settings['policy_timeout_s'],
+        )

@@ -77,27 +77,39 @@ class Deadlines:
     def __init__(self) -> None:
         """Nothing is missed before the first action."""
         self._last_s: float | None = None
+        self._last_answered: tuple[int, int] | None = None
         self._missed: deque[tuple[float, int]] = deque()
         self.total = 0
 
     def met(self, now_s: float, period_s: float) -> None:
         """An action went out; whole periods since the one before it, rounded, were missed."""
         if self._last_s is not None:
-            missed = int((now_s - self._last_s) / period_s + 0.5) - 1
-            if missed > 0:
-                self._missed.append((now_s, missed))
-                self.total += missed
+            self._miss(now_s, int((now_s - self._last_s) / period_s + 0.5) - 1)
         self._last_s = now_s
+
+    def answered(self, now_s: float, episode_id: int, step: int) -> None:
+        """A state got its action; steps of the episode since the one before it were missed.
+
+        For simulated time, which goes by in steps: the deadline of a state is the next one.
+        """
+        if self._last_answered is not None and self._last_answered[0] == episode_id:
+            self._miss(now_s, step - self._last_answered[1] - 1)
+        self._last_answered = (episode_id, step)
 
     def pause(self) -> None:
         """No action is due before the next one."""
-        self._last_s = None
+        self._last_s = self._last_answered = None
 
     def in_last_minute(self, now_s: float) -> int:
         """Number of misses in the last minute."""
         while self._missed and now_s - self._missed[0][0] > MINUTE_S:
             self._missed.popleft()
         return sum(missed for _, missed in self._missed)
+
+    def _miss(self, now_s: float, count: int) -> None:
+        if count > 0:
+            self._missed.append((now_s, count))
+            self.total += count
 
 
 class Faults:

@@ -61,6 +61,23 @@ GOAL_NODE = (
         maximum=3600,
         changes='now',
     ),
+    Parameter(
+        'goal_lease_s',
+        2.0,
+        'the policy drops a goal when this node, which repeats it, is silent for this long, '
+        'seconds; 0: never',
+        minimum=0,
+        maximum=3600,
+        changes='now',
+    ),
+    Parameter(
+        'policy_timeout_s',
+        2.0,
+        'diagnostics warn when a goal is in force and no policy was heard for this long, seconds',
+        minimum=0.1,
+        maximum=3600,
+        changes='now',
+    ),
 )
 
 SIM_BRIDGE_NODE = (
@@ -207,7 +224,8 @@ POLICY_NODE = (
     Parameter(
         'state_timeout_s',
         0.5,
-        'realtime: without a state for this long the action is zero, seconds of the node clock',
+        'realtime: without a state for this long the action is zero, seconds, both of the node '
+        'clock and of real time',
         minimum=0.01,
         maximum=3600,
         changes='now',
@@ -224,7 +242,7 @@ POLICY_NODE = (
         'warn_missed_deadlines',
         0,
         'diagnostics warn when more control periods than this passed without an action in a '
-        'minute; not counted on simulated time',
+        'minute; on simulated time, the steps of the simulator towards a goal',
         minimum=0,
         maximum=10**6,
         changes='now',

@@ -1,33 +1,34 @@
 """What the policy publishes."""
 
-import secrets
 import time
 
 from metagcttt_interfaces.msg import ActionCommand, AdaptationReport, PolicyStatus
 from rclpy.lifecycle import LifecycleNode
 from std_msgs.msg import Header
 
-from metagcttt.converters import action_message, report_message
+from metagcttt.adaptation_report import report_message
+from metagcttt.converters import action_message
 from metagcttt.deployment import Outcome
 from metagcttt.pilot import Command, Query, State
-from metagcttt.qos import COMMAND, EVENTS, LATCHED, sent_to_recorders
+from metagcttt.qos import COMMAND, EVENTS, keep_several, LATCHED
 
 STATUS_PERIOD_S = 0.2
 
 
 class PolicyAnnouncer:
-    """Publishes `action`, `adaptation` and `policy_status` while the node is active.
+    """Publishes `action`, `adaptation` and `policy_status` while the node is active."""
 
-    Attributes:
-        instance: Drawn at random, to tell two policies in one graph apart.
-    """
+    def __init__(self, node: LifecycleNode, instance: int) -> None:
+        """Connect.
 
-    def __init__(self, node: LifecycleNode) -> None:
-        """Connect through `node`."""
-        self.instance = secrets.randbits(64)
+        Args:
+            node: The node to publish through.
+            instance: Number that tells this policy from others in the graph.
+        """
         self._node = node
+        self._instance = instance
         self._actions = node.create_lifecycle_publisher(
-            ActionCommand, 'action', sent_to_recorders(COMMAND)
+            ActionCommand, 'action', keep_several(COMMAND)
         )
         self._reports = node.create_lifecycle_publisher(AdaptationReport, 'adaptation', EVENTS)
         self._statuses = node.create_lifecycle_publisher(PolicyStatus, 'policy_status', LATCHED)
@@ -49,6 +50,7 @@ class PolicyAnnouncer:
                 query_id=command.query_id,
                 values=command.values,
                 adapted=command.adapted,
+                instance=self._instance,
             )
         )
 
@@ -82,7 +84,7 @@ class PolicyAnnouncer:
 
     def status(self, query: Query | None, state: State | None) -> None:
         """What the policy is doing, when that is new or was last said a while ago."""
-        status = PolicyStatus(instance=self.instance)
+        status = PolicyStatus(instance=self._instance)
         if query is not None:
             status.query_id = query.query_id
             status.episode_id = query.episode_id

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 import time
 
-from metagcttt.adaptation_worker import AdaptationWorker
 from metagcttt.health import Deadlines, Faults, Health, Level, Rate, Samples
 from metagcttt.pilot import Query
 
@@ -43,7 +42,7 @@ class PolicyMonitor:
         zero_reason: str,
         query: Query | None,
         num_publishers: int,
-        worker: AdaptationWorker,
+        num_pending: int,
         limits: Limits,
     ) -> Health:
         """The health now.
@@ -53,7 +52,7 @@ class PolicyMonitor:
             zero_reason: Why the action is zero although the node acts; empty when it is not.
             query: The goal in force.
             num_publishers: Of actions in the graph, this one included.
-            worker: What adapts.
+            num_pending: Adaptations that have not ended.
             limits: What is still healthy.
         """
         now_s = time.monotonic()
@@ -69,7 +68,7 @@ class PolicyMonitor:
             'missed_deadlines_last_minute': str(missed),
             'adapt_last_ms': f'{self.adapt_ms.last():.1f}',
             'adapt_p99_ms': f'{self.adapt_ms.percentile(99):.1f}',
-            'adaptations_pending': str(worker.num_pending),
+            'adaptations_pending': str(num_pending),
             'action_publishers': str(num_publishers),
             **{kind: str(count) for kind, count in sorted(self.faults.counts.items())},
         }

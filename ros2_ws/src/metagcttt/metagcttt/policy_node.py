@@ -1,5 +1,6 @@
 """The lifecycle of the policy; what it does while active is in `policy_session`."""
 
+import secrets
 from typing import Any
 
 from metagcttt_core import FilterConfig
@@ -28,6 +29,7 @@ class PolicyNode(LifecycleNode):
         """
         super().__init__('policy_node', **kwargs)
         self._session: PolicySession | None = None
+        self._instance = secrets.randbits(64)
         self._enabled = True
         self._settings = ParameterSet(
             self, POLICY_NODE, is_configured=lambda: self._session is not None
@@ -69,7 +71,9 @@ class PolicyNode(LifecycleNode):
         if self._settings['threads']:
             torch.set_num_threads(self._settings['threads'])
         self._failure = ''
-        self._session = PolicySession(self, self._settings, deployment, enabled=self._enabled)
+        self._session = PolicySession(
+            self, self._settings, deployment, instance=self._instance, enabled=self._enabled
+        )
         agent, dataset = deployment.agent, deployment.dataset
         self.get_logger().info(
             f'{agent.name} policy for observations of {agent.obs_dim} and actions of '

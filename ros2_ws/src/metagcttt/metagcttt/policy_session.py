@@ -1,32 +1,29 @@
 """A configured policy on the graph: takes states and goals, adapts and acts."""
 
 from dataclasses import replace
-from functools import partial
 import time
 
 from metagcttt_core import TTTConfig
-from metagcttt_core.adaptation import AdaptationCancelled
 from metagcttt_interfaces.msg import GoalQuery, MazeState, PolicyStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode
 from rclpy.timer import Timer
 
-from metagcttt.adaptation_worker import AdaptationWorker
 from metagcttt.converters import to_array
-from metagcttt.deployment import answer_query, Deployment, Outcome
-from metagcttt.expert_cache import ExpertCache
+from metagcttt.deployment import Deployment
 from metagcttt.health import Health
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.pilot import choose, Query, State
 from metagcttt.policy_announcer import PolicyAnnouncer
 from metagcttt.policy_health import Limits, PolicyMonitor
+from metagcttt.policy_safety import Safety
 from metagcttt.qos import LATCHED, state_profile
+from metagcttt.query_adapter import QueryAdapter
 from metagcttt.state_order import StateOrder
 from metagcttt.vectors import vector_fault
 
 WARNING_PERIOD_S = 5.0
 WATCH_PERIOD_S = 0.1
-RIVAL_S = 1.0  # another policy that was heard this lately is there
 
 
 class PolicySession:
@@ -43,6 +40,7 @@ class PolicySession:
         settings: ParameterSet,
         deployment: Deployment,
         *,
+        instance: int,
         enabled: bool = True,
     ) -> None:
         """Connect; nothing is published before `start`.
@@ -51,33 +49,28 @@ class PolicySession:
             node: The node to connect through.
             settings: Its parameters.
             deployment: Policy and dataset.
+            instance: Number that tells this policy from others in the graph.
             enabled: Whether actions may be other than zero.
         """
-        self._enabled = enabled
-        self._order = StateOrder()
-        self._monitor = PolicyMonitor()
-        self._rival_seen_s = float('-inf')
-        self._received_ns = 0  # when the newest state was; 0 once it is answered
         self._node = node
         self._settings = settings
         self._deployment = deployment
+        self._instance = instance
         self._lockstep = settings['stepping'] == 'lockstep'
         self._acting = False
         self._timer: Timer | None = None
         self._query: Query | None = None
+        self._goal_message: GoalQuery | None = None
         self._state: State | None = None
-        self._state_time = node.get_clock().now()
+        self._received_ns = 0  # when the newest state was; 0 once it is answered
         self._answered = True  # whether the newest state got its action, in lockstep
-        self._adaptation_finished = node.create_guard_condition(self._on_adaptation_finished)
-        self._worker: AdaptationWorker[Query, Outcome] = AdaptationWorker(
-            self._adaptation_finished.trigger, settings['threads']
+        self._order = StateOrder()
+        self._monitor = PolicyMonitor()
+        self._safety = Safety(enabled=enabled)
+        self._say = PolicyAnnouncer(node, instance)
+        self._adapter = QueryAdapter(
+            node, settings, deployment, self._say, self._monitor, self._proceed
         )
-        self._cache = ExpertCache(
-            settings['cache_size'],
-            settings['cache_cell_m'],
-            deployment.trajectory_filter.config.position_dims,
-        )
-        self._say = PolicyAnnouncer(node)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._watch = node.create_timer(WATCH_PERIOD_S, self._on_watch, clock=steady)
         profile = state_profile(settings['stepping'])
@@ -101,7 +94,7 @@ class PolicySession:
     def stop(self) -> None:
         """Stop, in realtime with a zero action; a goal in force is taken up again later."""
         self._acting = False
-        self._worker.cancel()
+        self._adapter.cancel()
         if self._query is not None:
             self._query.adapted_at = None
         if self._timer is not None:
@@ -110,7 +103,7 @@ class PolicySession:
 
     def enable(self, enabled: bool) -> None:
         """Let actions be other than zero, or not; takes effect at once."""
-        self._enabled = enabled
+        self._safety.enabled = enabled
         if self._timer is not None:
             self._on_tick()
 
@@ -118,12 +111,11 @@ class PolicySession:
         """Disconnect and end the adaptation thread."""
         self._acting = False
         self._stop_timer()
-        self._worker.close()
+        self._adapter.close()
         for subscription in self._inputs:
             self._node.destroy_subscription(subscription)
         self._node.destroy_timer(self._watch)
         self._say.destroy()
-        self._node.destroy_guard_condition(self._adaptation_finished)
 
     def pace(self) -> None:
         """(Re)start the timer that acts in realtime, at the rate set now."""
@@ -163,20 +155,24 @@ class PolicySession:
                 ended=message.terminated or message.truncated,
                 fault=fault,
             )
-        self._state_time = self._node.get_clock().now()
+        self._safety.saw_state(now_s, self._clock_s())
         self._received_ns = info['received_timestamp']
         self._answered = False
         query = self._query
         if query is not None and query.adapting and not query.serves(self._state):
-            self._worker.cancel()
+            self._adapter.cancel()
         self._proceed()
 
     def _on_status(self, message: PolicyStatus) -> None:
-        if message.instance != self._say.instance:
-            self._rival_seen_s = time.monotonic()
+        if message.instance != self._instance:
+            self._safety.rivals.hear(message.instance, time.monotonic())
 
     def _on_goal(self, message: GoalQuery) -> None:
-        self._worker.cancel()
+        self._safety.saw_goal(time.monotonic(), message.lease_s if message.active else 0.0)
+        if message == self._goal_message:
+            return  # repeated, so that its silence means that the goal node is gone
+        self._goal_message = message
+        self._adapter.cancel()
         self._query = None
         goal = to_array(message.goal)
         fault = vector_fault('the goal', goal, self._deployment.agent.obs_dim)
@@ -210,7 +206,7 @@ class PolicySession:
             horizon=self._settings['horizon'] or None,
         )
 
-    # --- adapting ----------------------------------------------------------------------------
+    # --- what is done with it ----------------------------------------------------------------
 
     def _proceed(self) -> None:
         """Do what the newest state and goal ask for: adapt and act."""
@@ -218,80 +214,42 @@ class PolicySession:
         if not self._acting or query is None or state is None:
             return
         if query.needs_adaptation(state):
-            self._adapt(query, state)
+            self._adapter.adapt(query, state)
         if not self._answered and query.has_action(state):
             self._answered = True
             self._publish_action(query)
             if self._timer is not None:
                 self._timer.reset()
-        self._on_watch()
+        self._say.status(query, state)
 
-    def _adapt(self, query: Query, state: State) -> None:
-        query.adapted_at = state.step
-        query.cache_key = self._cache.key(state.observation, query.goal, query.config)
-        known = self._cache.find(query.cache_key)
-        if known is not None:
-            self._conclude(query, known, cached=True)
-            return
-        answer = partial(
-            answer_query,
-            self._deployment,
-            state.observation,
-            query.goal,
-            query.config,
-            query.seed,
-            on_step=partial(setattr, query, 'steps_done'),
-        )
-        if query.config.steps == 0:
-            self._conclude(query, answer(lambda: False))
-        else:
-            query.adapting, query.steps_done = True, 0
-            self._worker.start(query, answer)
-
-    def _on_adaptation_finished(self) -> None:
-        for query, future in self._worker.take_finished():
-            query.adapting = False
-            reason = 'cancelled by a newer goal, a newer episode or a stop'
-            if not future.cancelled():
-                try:
-                    self._conclude(query, future.result())
-                    continue
-                except AdaptationCancelled:
-                    pass
-                except (ValueError, RuntimeError) as error:
-                    reason = self._monitor.remark = f'failed: {error}'
-                    self._node.get_logger().error(f'goal {query.query_id}: {reason}')
-            self._say.report(query.query_id, query.episode_id, reason=reason)
-        self._proceed()
-
-    def _conclude(self, query: Query, outcome: Outcome, *, cached: bool = False) -> None:
-        if not cached:
-            self._monitor.adapt_ms.add(1000 * outcome.adaptation.seconds)
-            self._cache.keep(query.cache_key, outcome)
-        self._monitor.remark = outcome.adaptation.reason
-        query.expert = outcome.adaptation.agent
-        query.adapted = outcome.adaptation.accepted
-        query.steps_done = len(outcome.adaptation.train_losses)
-        self._say.report(query.query_id, query.episode_id, outcome, cached=cached)
+    def _on_watch(self) -> None:
+        """Look after what may stop coming; not by the node's clock, which may stand still."""
+        now_s = time.monotonic()
+        query = self._query
+        if query is not None and self._safety.lose_goal(query.query_id, now_s):
+            self._node.get_logger().error(self._safety.lost_goal)
+            self._adapter.cancel()
+            self._query = self._goal_message = None
+        if self._timer is not None and self._zero_reason():
+            self._publish_action(self._query)
+        self._say.status(self._query, self._state)
 
     # --- what is published -------------------------------------------------------------------
 
     def _on_tick(self) -> None:
         self._publish_action(self._query)
 
+    def _clock_s(self) -> float:
+        return self._node.get_clock().now().nanoseconds / 1e9
+
     def _zero_reason(self) -> str:
         """Why the robot may not move now; empty when it may."""
-        now_s = time.monotonic()
-        if not self._enabled:
-            return 'disabled by the service enable'
-        if now_s - self._rival_seen_s < RIVAL_S:
-            return 'another policy node acts in this graph'
-        if self._state is None:
-            return ''
-        age_s = (self._node.get_clock().now() - self._state_time).nanoseconds / 1e9
-        if not self._lockstep and age_s > self._settings['state_timeout_s']:
-            return f'no state for {age_s:.1f} s'
-        return self._state.fault
+        return self._safety.zero_reason(
+            self._state,
+            now_s=time.monotonic(),
+            clock_s=self._clock_s(),
+            timeout_s=float('inf') if self._lockstep else self._settings['state_timeout_s'],
+        )
 
     def _publish_action(self, query: Query | None) -> None:
         """Publish the action for the newest state; zero without a query."""
@@ -318,16 +276,18 @@ class PolicySession:
         if self._received_ns:
             self._monitor.latency_ms.add((time.time_ns() - self._received_ns) / 1e6)
             self._received_ns = 0
-        # Simulated time goes by in steps that may be longer than the period.
-        if self._timer is not None and not self._node.get_parameter('use_sim_time').value:
+        if self._timer is None or self._state is None:
+            return
+        if not self._node.get_parameter('use_sim_time').value:
             self._monitor.deadlines.met(now_s, 1.0 / self._settings['rate_hz'])
+        elif self._query is not None and self._query.has_action(self._state):
+            self._monitor.deadlines.answered(now_s, self._state.episode_id, self._state.step)
+        else:
+            self._monitor.deadlines.pause()
 
     def _no_source_reason(self) -> str:
-        # Simulated time stands still without a simulator, and no state gets too old.
+        # In lockstep no state gets too old.
         return '' if self._node.count_publishers('state') else 'nobody publishes states'
-
-    def _on_watch(self) -> None:
-        self._say.status(self._query, self._state)
 
     def examine(self) -> Health:
         """How the policy is."""
@@ -336,7 +296,7 @@ class PolicySession:
             zero_reason=self._zero_reason() or self._no_source_reason(),
             query=self._query,
             num_publishers=self._node.count_publishers('action'),
-            worker=self._worker,
+            num_pending=self._adapter.num_pending,
             limits=Limits(
                 latency_ms=self._settings['warn_latency_ms'],
                 missed_deadlines=self._settings['warn_missed_deadlines'],

@@ -42,11 +42,11 @@ def state_profile(stepping: str) -> QoSProfile:
     return LATCHED if stepping == 'lockstep' else SENSOR
 
 
-def sent_to_recorders(profile: QoSProfile) -> QoSProfile:
-    """The profile of a publisher whose every message counts for those who record it.
+def keep_several(profile: QoSProfile) -> QoSProfile:
+    """The same with a depth of 20, for one end of a topic on which every message counts.
 
-    With a depth of 1 a newer message takes the place of one that a slow reader has not got yet. A
-    reader with a depth of 1 still sees the newest alone.
+    With a depth of 1 a newer message takes the place of one that was not read yet: a slow recorder
+    would miss some, and of two senders one would not be noticed.
     """
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,

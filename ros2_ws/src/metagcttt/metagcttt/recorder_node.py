@@ -18,7 +18,8 @@ from metagcttt.qos import recording_profile
 from metagcttt.recording import message_class, Recording, UnknownTypeError
 
 SEARCH_PERIOD_S = 0.1
-GRACE_S = 0.2
+QUIET_S = 0.2
+GRACE_S = 1.2
 OF_ALL_ROBOTS = ('/clock', '/diagnostics')
 OF_ROS = ('/rosout', '/parameter_events')
 
@@ -55,12 +56,18 @@ class RecorderNode(Node):
         self._search()
 
     def destroy_node(self) -> None:
-        """Record what is still on its way, finish the file and destroy the node."""
+        """Record what is still on its way, finish the file and destroy the node.
+
+        That takes until nothing has come for `QUIET_S`, and `GRACE_S` on a graph that goes on.
+        """
         executor = SingleThreadedExecutor(context=self.context)
         executor.add_node(self)
-        deadline = time.monotonic() + GRACE_S
-        while (left := deadline - time.monotonic()) > 0:
-            executor.spin_once(timeout_sec=left)
+        begin = heard = time.monotonic()
+        while (now := time.monotonic()) < min(heard + QUIET_S, begin + GRACE_S):
+            before = self._recording.num_messages
+            executor.spin_once(timeout_sec=heard + QUIET_S - now)
+            if self._recording.num_messages > before:
+                heard = time.monotonic()
         executor.shutdown()
         super().destroy_node()
         self._recording.close()

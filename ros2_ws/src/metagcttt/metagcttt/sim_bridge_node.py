@@ -1,5 +1,6 @@
 """The node that owns a simulator."""
 
+import math
 import time
 from typing import Any
 
@@ -30,9 +31,11 @@ from metagcttt.health import Health
 from metagcttt.pacing import Pacer
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import SIM_BRIDGE_NODE
-from metagcttt.qos import COMMAND, EVENTS, LATCHED, SENSOR, sent_to_recorders, state_profile
+from metagcttt.qos import COMMAND, EVENTS, keep_several, LATCHED, SENSOR, state_profile
 from metagcttt.sim_health import SimMonitor
 from metagcttt.vectors import vector_fault
+
+HEARTBEAT_S = 0.1
 
 
 class SimBridgeNode(Node):
@@ -40,9 +43,10 @@ class SimBridgeNode(Node):
 
     In `realtime` it steps by itself, with the newest action or, when that is too old, with zero.
     In `lockstep` it publishes a state and stands still until the action for that very state
-    arrives. After a task episode has ended nothing moves until the next reset. While it is paused
-    nothing moves but by the service `step`; in realtime the last state is published on, so that
-    nobody takes the simulator for dead.
+    arrives. While more than one node sends actions, it takes zero instead. After a task episode
+    has ended nothing moves until the next reset. While it is paused nothing moves but by the
+    service `step`. In realtime the last state is published on while it is paused or steps rarely,
+    so that nobody takes the simulator for dead.
 
     The header of a state carries simulated time, which starts at 0 with the node and never goes
     back; `/clock` carries the same.
@@ -73,14 +77,15 @@ class SimBridgeNode(Node):
         self._paused = bool(self._settings['start_paused'])
         self._awaiting: NDArray[np.float64] | None = None  # lockstep: arrived while paused
 
-        profile = sent_to_recorders(state_profile(self._settings['stepping']))
+        profile = keep_several(state_profile(self._settings['stepping']))
         self._states = self.create_publisher(MazeState, 'state', profile)
         self._events = self.create_publisher(EpisodeEvent, 'episode', EVENTS)
         self._map = self.create_publisher(OccupancyGrid, 'map', LATCHED)
         self._clock_messages = None
         if self._settings['publish_clock']:
             self._clock_messages = self.create_publisher(ClockMessage, '/clock', SENSOR)
-        self.create_subscription(ActionCommand, 'action', self._on_action, COMMAND)
+        # Of two senders none is overheard; the newest action still wins.
+        self.create_subscription(ActionCommand, 'action', self._on_action, keep_several(COMMAND))
         self.create_service(Trigger, 'reset', self._on_reset)
         self.create_service(SetTask, 'set_task', self._on_set_task)
         self.create_service(SetBool, 'pause', self._on_pause)
@@ -97,6 +102,7 @@ class SimBridgeNode(Node):
         )
         self._begin(self._simulator.reset_free(self._settings['seed']), self._settings['seed'])
         self._timer: Timer | None = None
+        self._beats_per_step = 1
         self._pacer = Pacer(spec.control_period_s, time.monotonic())
         self._pace()
 
@@ -113,9 +119,12 @@ class SimBridgeNode(Node):
             self.destroy_timer(self._timer)
         period_s = self._simulator.spec.control_period_s / self._settings['speed_factor']
         self._pacer = Pacer(period_s, time.monotonic())
+        self._beats_per_step = math.ceil(period_s / HEARTBEAT_S)
         # Not the node's clock: that one may be the simulated time made here.
         self._timer = self.create_timer(
-            period_s, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME)
+            period_s / self._beats_per_step,
+            self._on_tick,
+            clock=Clock(clock_type=ClockType.STEADY_TIME),
         )
 
     def _on_parameters_set(self, parameters: list[Parameter]) -> None:
@@ -129,8 +138,11 @@ class SimBridgeNode(Node):
             self._publish_state()
             return
         lost = self._pacer.num_lost
-        for _ in range(self._pacer.due(time.monotonic())):
+        due = self._pacer.due(time.monotonic())
+        for _ in range(due):
             self._advance_realtime()
+        if not due and self._beats_per_step > 1:
+            self._publish_state()
         if self._pacer.num_lost > lost:
             self.get_logger().warning(
                 f'too slow for speed_factor {self._settings["speed_factor"]:g}: '
@@ -144,6 +156,8 @@ class SimBridgeNode(Node):
         self._advance(self._action if fresh else np.zeros_like(self._action))
 
     def _advance(self, action: NDArray[np.float64]) -> None:
+        if self._monitor.num_senders() > 1:
+            action = np.zeros_like(action)
         self._time_ns += self._period_ns
         if not (self._last.terminated or self._last.truncated):
             self._last = self._simulator.step(action)
@@ -159,7 +173,7 @@ class SimBridgeNode(Node):
             return
         values = to_array(message.values)
         fault = vector_fault('the action', values, self._simulator.spec.act_dim)
-        self._monitor.saw_action(fault)
+        self._monitor.saw_action(fault, message.instance)
         if fault:
             self.get_logger().warning(f'ignored: {fault}', throttle_duration_sec=5.0)
         elif self._lockstep and self._paused:

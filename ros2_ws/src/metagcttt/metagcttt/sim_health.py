@@ -3,6 +3,7 @@
 import time
 
 from metagcttt.health import Faults, Health, Level, Rate
+from metagcttt.senders import Senders
 
 
 class SimMonitor:
@@ -13,13 +14,24 @@ class SimMonitor:
         self.states = Rate()
         self.actions = Rate()
         self.faults = Faults()
+        self._senders = Senders()
 
-    def saw_action(self, fault: str) -> None:
-        """An action for this episode arrived; `fault` says why it is not used."""
+    def saw_action(self, fault: str, instance: int) -> None:
+        """An action for this episode arrived.
+
+        Args:
+            fault: Why it is not used; empty when it is.
+            instance: Number of its sender.
+        """
         now_s = time.monotonic()
+        self._senders.hear(instance, now_s)
         self.actions.add(now_s)
         if fault:
             self.faults.note('malformed_actions', fault, now_s)
+
+    def num_senders(self) -> int:
+        """How many nodes have sent actions for this episode within the last second."""
+        return self._senders.count(time.monotonic())
 
     def examine(self, *, num_publishers: int, action_is_old: bool) -> Health:
         """The health now.
@@ -37,7 +49,9 @@ class SimMonitor:
             **{kind: str(count) for kind, count in sorted(self.faults.counts.items())},
         }
         level, message = Level.OK, 'stepping'
-        if recent := self.faults.recent(now_s):
+        if (num_senders := self.num_senders()) > 1:
+            level, message = Level.ERROR, f'the action is zero: {num_senders} nodes send actions'
+        elif recent := self.faults.recent(now_s):
             level, message = Level.ERROR, f'an action was ignored: {recent}'
         elif num_publishers > 1:
             level, message = Level.WARN, f'{num_publishers} nodes publish actions'

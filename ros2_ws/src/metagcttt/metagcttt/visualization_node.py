@@ -15,8 +15,8 @@ from sim_bridge import describe_environment
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
+from metagcttt.assets import checkpoint_path, dataset_path
 from metagcttt.converters import to_array
-from metagcttt.deployment import checkpoint_path, dataset_path
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import VISUALIZATION_NODE
 from metagcttt.pictures import markers, odometry, path, thinned
