@@ -6,6 +6,7 @@ import tyro
 
 from tools.benchmarks.meta import MetaBenchmark
 from tools.benchmarks.report import Benchmark
+from tools.benchmarks.restarts import RestartsBenchmark
 from tools.benchmarks.retrieval import RetrievalBenchmark
 from tools.benchmarks.ros import RosBenchmark
 from tools.benchmarks.sim import SimBenchmark
@@ -17,6 +18,7 @@ Examples: python -m tools.benchmark retrieval, python -m tools.benchmark trainin
 
 BENCHMARKS: dict[str, Callable[..., Benchmark]] = {
     'meta': MetaBenchmark,
+    'restarts': RestartsBenchmark,
     'retrieval': RetrievalBenchmark,
     'ros': RosBenchmark,
     'sim': SimBenchmark,

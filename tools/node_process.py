@@ -71,7 +71,7 @@ class NodeProcess:
         lines = self.log.read_text(encoding='utf-8', errors='replace').splitlines()[-_LOG_LINES:]
         return f'{self.executable} {problem}; the end of {self.log}:\n  ' + '\n  '.join(lines)
 
-    def stop(self, timeout_s: float = 5.0, signal_number: int = signal.SIGINT) -> int:
+    def stop(self, timeout_s: float = 20.0, signal_number: int = signal.SIGINT) -> int:
         """End it, as Ctrl-C would, by force after `timeout_s`; returns its exit status."""
         for number in (signal_number, signal.SIGKILL):
             if self._process.poll() is None:

@@ -59,7 +59,7 @@ class Graph:
         self._executor.remove_node(node)
         node.destroy_node()
 
-    def wait(self, condition: Callable[[], Any], what: str, timeout_s: float = 20.0) -> Any:
+    def wait(self, condition: Callable[[], Any], what: str, timeout_s: float = 60.0) -> Any:
         """Spin until `condition` gives something true and return that.
 
         Raises:

@@ -97,7 +97,7 @@ def test_robot_stands_still_while_two_nodes_send_actions(graph: Graph) -> None:
 def test_slow_simulator_is_heard_between_its_steps(graph: Graph) -> None:
     graph.add(SimBridgeNode, speed_factor=0.01)  # ten seconds a step
     states = graph.collect(MazeState, 'state', ANY)
-    graph.wait(lambda: len(states) >= 6, 'states', timeout_s=5)
+    graph.wait(lambda: len(states) >= 6, 'states', timeout_s=15)
     assert {state.step for state in states} <= {0, 1}
 
 

@@ -224,7 +224,7 @@ def test_rate_applies_at_once(make_rig) -> None:
     rig = make_rig(stepping='realtime', rate_hz=0.1, state_timeout_s=30.0)
     rig.state()
     assert rig.set(rate_hz=100.0) == ''
-    rig.graph.wait(lambda: len(rig.record.actions) > 3, 'actions at the new rate', timeout_s=5)
+    rig.graph.wait(lambda: len(rig.record.actions) > 3, 'actions at the new rate', timeout_s=20)
 
 
 @pytest.mark.parametrize(

@@ -71,7 +71,7 @@ def test_signal_ends_the_node_cleanly(
     if node == 'sim_bridge_node':  # has imported glfw, whose own script would speak up too
         graph.wait(lambda: graph.node.count_publishers('state'), 'the simulator', timeout_s=60)
     os.killpg(process.pid, number)
-    output, errors = process.communicate(timeout=20)
+    output, errors = process.communicate(timeout=60)
     assert (process.returncode, errors) == (0, ''), output
 
 
@@ -83,12 +83,12 @@ def test_signal_during_the_start_ends_the_node_cleanly(
     process = start('policy_node', '--ros-args', *given)
     # Handlers are in place before PyTorch, which takes seconds, is imported.
     status = Path(f'/proc/{process.pid}/status')
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 60
     while not catches(status, signal.SIGTERM):
         assert process.poll() is None
         assert time.monotonic() < deadline
     os.killpg(process.pid, signal.SIGTERM)
-    output, errors = process.communicate(timeout=30)
+    output, errors = process.communicate(timeout=60)
     assert (process.returncode, errors) == (0, ''), output
 
 

@@ -165,7 +165,7 @@ def test_speed_factor_applies_at_once(graph: Graph) -> None:
     states = Record(graph, ANY).states
     [result] = node.set_parameters([Parameter('speed_factor', value=50.0)])
     assert result.successful
-    graph.wait(lambda: len(states) > 3, 'states at the new pace', timeout_s=5)
+    graph.wait(lambda: len(states) > 3, 'states at the new pace', timeout_s=20)
 
 
 def pause(graph: Graph, paused: bool) -> str:
@@ -223,12 +223,19 @@ def test_paused_lockstep_keeps_the_action_until_the_step(graph: Graph) -> None:
 
 def test_pace_keeps_to_the_clock_of_the_wall(graph: Graph) -> None:
     graph.add(SimBridgeNode, speed_factor=10.0)
-    clocks = graph.collect(Clock, '/clock', ANY)
-    graph.wait(lambda: clocks, 'the clock')
-    began, first = time.monotonic(), seconds(clocks[-1].clock)
-    graph.wait(lambda: time.monotonic() - began > 3.0, 'three seconds')
-    # Half a second of delay by other programs is made up for; the rest may be one step.
-    assert seconds(clocks[-1].clock) - first == pytest.approx(30.0, rel=0.02)
+    lags: list[tuple[float, float]] = []
+
+    def hear(message: Clock) -> None:
+        now = time.monotonic()
+        lags.append((now, 10.0 * now - seconds(message.clock)))
+
+    graph.node.create_subscription(Clock, '/clock', hear, ANY)
+    graph.wait(lambda: lags, 'the clock')
+    graph.wait(lambda: lags[-1][0] - lags[0][0] > 3.0, 'three seconds')
+    # Other programs can only make a message late: the least lag of a second is the pace's own.
+    first = min(lag for now, lag in lags if now < lags[0][0] + 1.0)
+    last = min(lag for now, lag in lags if now > lags[-1][0] - 1.0)
+    assert last - first == pytest.approx(0.0, abs=0.4)  # of more than 20 s
 
 
 def test_unknown_environment_is_refused_with_the_nearest(graph: Graph) -> None:

@@ -311,7 +311,7 @@ def test_end_in_the_middle_leaves_no_worker_and_resume_gives_the_same_files(
 ) -> None:
     output = tmp_path / 'ended' / 'maze.npz'
     children, errors = signal_in_the_middle(output, number)
-    wait_until(lambda: not any(is_running(pid) for pid in children), timeout_s=20)
+    wait_until(lambda: not any(is_running(pid) for pid in children), timeout_s=60)
     assert not output.exists()
     # Workers are silent. (glfw, while imported, asks for its version in a script of its own.)
     tracebacks = errors.split('Traceback (most recent call last)')[1:]

@@ -49,3 +49,15 @@ def test_wrong_setting_is_refused(capsys) -> None:
     with pytest.raises(SystemExit):
         benchmark.main(['ros', '--stepping', 'fast'])
     assert 'realtime' in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.mujoco
+def test_benchmark_restarts_and_ends_every_node(tmp_path: Path, capsys) -> None:
+    benchmark.main(['restarts', '--out', str(tmp_path), '--repeats', '1'])
+    rows = json.loads((tmp_path / 'restarts.json').read_text())['results']['seconds']
+    assert [row['node'] for row in rows] == ['sim_bridge_node', 'goal_node', 'policy_node']
+    for row in rows:
+        assert 0 < row['restart (s)'] == row['longest']
+        assert 0 < row['end (s)'] == row['longest end']
+    assert '| policy_node |' in capsys.readouterr().out
