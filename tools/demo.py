@@ -1,27 +1,22 @@
 """The main job: goals published on a topic make a robot filter, adapt and drive there."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager, ExitStack
 from functools import partial
 import json
-import os
 from pathlib import Path
 from typing import Any
 
-from domain_coordinator import domain_id
 from metagcttt.commander import NoAnswerError
 from metagcttt_core import TrajectoryDataset
 from metagcttt_core.config import assets_dir, Settings
 from metagcttt_core.files import atomic_write
 import numpy as np
 from pydantic import Field
-import rclpy
 from sim_bridge import make_simulator
-from tqdm import tqdm
 
 from tools.cli import fail, parse
+from tools.graph_drive import drive_arms
 from tools.maze_client import GoalOutcome, MazeClient
-from tools.node_process import NodeFailedError, NodeProcess
+from tools.node_process import NodeFailedError
 from tools.plots import demo_picture, save
 from tools.runs import provenance
 
@@ -34,7 +29,6 @@ OUT/demo.png."""
 
 _ENVIRONMENT = 'pointmaze-medium-v0'
 _ASSETS = 'pointmaze-medium-navigate'
-START_TIMEOUT_S = 30.0
 
 
 class DemoSettings(Settings):
@@ -65,42 +59,22 @@ def run_arms(settings: DemoSettings) -> dict[str, list[GoalOutcome]]:
         f'base + TTT (K = {settings.steps})': ('base', settings.steps),
         f'meta + TTT (K = {settings.steps})': ('meta', settings.steps),
     }
-    num_tasks = len(make_simulator(_ENVIRONMENT).tasks)
-    outcomes: dict[str, list[GoalOutcome]] = {}
-    with ExitStack() as stack:
-        stack.enter_context(own_domain())
-        logs = settings.out / 'logs'
-        nodes = [
-            NodeProcess('sim_bridge_node', {'stepping': 'lockstep'}, logs / 'sim_bridge_node.log'),
-            NodeProcess('goal_node', {'stepping': 'lockstep'}, logs / 'goal_node.log'),
-        ]
-        for node in nodes:
-            stack.enter_context(node)
-        rclpy.init()
-        stack.callback(rclpy.try_shutdown)
-        bar = stack.enter_context(tqdm(total=len(arms) * num_tasks, unit='goal', desc='demo'))
-        for number, (arm, (checkpoint, steps)) in enumerate(arms.items()):
-            parameters: dict[str, bool | int | float | str] = {
-                'checkpoint': str(assets_dir() / _ASSETS / checkpoint),
-                'adapt_steps': steps,
-                'stepping': 'lockstep',
-                'adaptation': 'hold',
-            }
-            log = logs / f'policy_node_{number}.log'
-            with NodeProcess('policy_node', parameters, log) as policy:
-                running = [*nodes, policy]
-                client = MazeClient(partial(check, running))
-                try:
-                    client.wait_until_ready(START_TIMEOUT_S)
-                    outcomes[arm] = []
-                    for task in range(1, num_tasks + 1):
-                        outcomes[arm].append(client.drive(task, settings.seed, settings.timeout_s))
-                        bar.update()
-                except NoAnswerError as error:
-                    logs_seen = (node.describe('still runs') for node in running)
-                    raise NoAnswerError('\n'.join([str(error), *logs_seen])) from error
-                client.destroy_node()
-    return outcomes
+    return drive_arms(
+        {
+            arm: {'checkpoint': str(assets_dir() / _ASSETS / checkpoint), 'adapt_steps': steps}
+            for arm, (checkpoint, steps) in arms.items()
+        },
+        [
+            partial(
+                MazeClient.drive,
+                task_id=task.task_id,
+                seed=settings.seed,
+                timeout_s=settings.timeout_s,
+            )
+            for task in make_simulator(_ENVIRONMENT).tasks
+        ],
+        logs=settings.out / 'logs',
+    )
 
 
 def report(settings: DemoSettings, outcomes: dict[str, list[GoalOutcome]]) -> None:
@@ -167,29 +141,6 @@ def format_table(arms: dict[str, list[dict[str, Any]]]) -> str:
             f'| {adaptation:.0f} | {transitions:.0f} |'
         )
     return '\n'.join(lines)
-
-
-def check(nodes: list[NodeProcess]) -> None:
-    """Raise if a node has died."""
-    for node in nodes:
-        node.check()
-
-
-@contextmanager
-def own_domain() -> Iterator[None]:
-    """A ROS domain that no other program on this machine uses, unless one is set already."""
-    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    if 'ROS_DOMAIN_ID' in os.environ:
-        yield
-        return
-    # Left by hand: its own `with` block would take an OSError from the body for a taken domain.
-    reservation = domain_id()
-    os.environ['ROS_DOMAIN_ID'] = str(reservation.__enter__())
-    try:
-        yield
-    finally:
-        del os.environ['ROS_DOMAIN_ID']
-        reservation.__exit__(None, None, None)
 
 
 if __name__ == '__main__':

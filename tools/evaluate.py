@@ -41,8 +41,8 @@ Job = tuple[str, str, int, int, int]
 """Checkpoint, environment, budget, seed and task."""
 
 
-class ProtocolSettings(Settings):
-    """How policies are evaluated."""
+class EpisodeSettings(Settings):
+    """Which episodes are driven, and how policies adapt in them."""
 
     dataset: Path = Field(
         Path('data/pointmaze-medium-navigate-v0.npz'), description='dataset to adapt on (npz)'
@@ -51,12 +51,17 @@ class ProtocolSettings(Settings):
         (0, 10, 20, 50, 100, 200), min_length=1, description='numbers of gradient steps K'
     )
     ttt: TTTConfig = Field(TTTConfig(), description='test-time training (steps come from budgets)')
-    actor_loss: ActorLoss | None = Field(
-        None, description="to adapt GCIQL policies with; each policy's own by default"
-    )
     filter: FilterConfig = FilterConfig()
     episodes: int = Field(10, ge=1, description='episodes per task and seed')
     seeds: tuple[int, ...] = Field((0, 1, 2), min_length=1, description='evaluation seeds')
+
+
+class ProtocolSettings(EpisodeSettings):
+    """How policies are evaluated."""
+
+    actor_loss: ActorLoss | None = Field(
+        None, description="to adapt GCIQL policies with; each policy's own by default"
+    )
     processes: int = Field(2, ge=1, description='processes to spread the work over')
     resume: bool = Field(False, description='keep what an interrupted call finished')
 
@@ -89,7 +94,7 @@ def main(argv: list[str] | None = None) -> None:
 
 def evaluate(settings: EvaluateSettings) -> list[dict[str, Any]]:
     """Success by policy and budget: rates per seed, their mean and error, and the AUC."""
-    environments = [_environment(path) for path in settings.checkpoints]
+    environments = [environment_of(path) for path in settings.checkpoints]
     num_tasks = make_simulator(environments[0]).spec.num_tasks
     jobs = [
         (str(path), environment, budget, seed, task)
@@ -163,7 +168,12 @@ def _run_jobs(settings: EvaluateSettings, jobs: list[Job]) -> dict[Job, float]:
     return log.finished
 
 
-def _environment(checkpoint: Path) -> str:
+def environment_of(checkpoint: Path) -> str:
+    """The environment that a policy is for.
+
+    Raises:
+        CheckpointError: If it is damaged or does not say so.
+    """
     environment = load_checkpoint(checkpoint).metadata.get('environment')
     if environment is None:
         raise CheckpointError(f'{checkpoint}: does not say which environment it is for')

@@ -85,13 +85,26 @@ class MazeClient(RobotCommander):
         ):
             self.wait(found, what, timeout_s)
 
-    def drive(self, task_id: int, seed: int, timeout_s: float = 60.0) -> GoalOutcome:
-        """Put the robot at a task's start, publish its goal and watch what becomes of it."""
+    def drive(
+        self, task_id: int, seed: int, timeout_s: float = 60.0, *, as_task: bool = False
+    ) -> GoalOutcome:
+        """Put the robot at a task's start, give it the goal and watch what becomes of it.
+
+        Args:
+            task_id: The evaluation task.
+            seed: Of the start, the goal and the adaptation.
+            timeout_s: Longest wait for anything, seconds.
+            as_task: Let the simulator announce the task's goal observation, as in an evaluation,
+                instead of publishing the goal's position on `goal_pose`.
+        """
         self._seen = _Watched()
-        answer = self.set_task(task_id, seed, timeout_s=timeout_s)
+        answer = self.set_task(task_id, seed, send_goal=as_task, timeout_s=timeout_s)
         if not answer.success:
             raise NoAnswerError(f'set_task {task_id} was refused: {answer.message}')
-        accepted = self._publish_goal(answer, timeout_s)
+        if as_task:
+            accepted = self._await_task_goal(answer.episode_id, timeout_s)
+        else:
+            accepted = self._publish_goal(answer, timeout_s)
         ends = (EpisodeEvent.REACHED, EpisodeEvent.TIMED_OUT, EpisodeEvent.ENDED)
         find_end = partial(self._events_of, accepted.query_id, ends)
         self.wait(lambda: bool(find_end()), 'the goal', timeout_s)
@@ -114,6 +127,18 @@ class MazeClient(RobotCommander):
             goal=(answer.goal_position.x, answer.goal_position.y),
             report=next(r for r in self._seen.reports if r.query_id == accepted.query_id),
         )
+
+    def _await_task_goal(self, episode_id: int, timeout_s: float) -> EpisodeEvent:
+        """Wait for what the goal node makes of the goal that the simulator announced."""
+
+        def answers() -> list[EpisodeEvent]:
+            return [event for event in self._answers(0) if event.episode_id == episode_id]
+
+        self.wait(lambda: bool(answers()), "the task's goal", timeout_s)
+        event = answers()[0]
+        if event.kind == EpisodeEvent.GOAL_REJECTED:
+            raise NoAnswerError(f'the goal was rejected: {event.reason}')
+        return event
 
     def _publish_goal(self, task: SetTask.Response, timeout_s: float) -> EpisodeEvent:
         """Publish the goal until the goal node accepts it in the new episode."""

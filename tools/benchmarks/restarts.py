@@ -15,7 +15,7 @@ import rclpy
 from tqdm import tqdm
 
 from tools.benchmarks.report import Benchmark, markdown_table, write_report
-from tools.demo import own_domain
+from tools.graph_drive import own_domain
 from tools.node_process import NodeFailedError, NodeProcess
 
 _GOAL = (20.0, 20.0)

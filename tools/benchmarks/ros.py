@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from tools.benchmarks.report import Benchmark, markdown_table, write_report
 from tools.benchmarks.state_source import Answers, StateSource
-from tools.demo import own_domain
+from tools.graph_drive import own_domain
 from tools.node_process import NodeProcess
 
 _ENDLESS_STEPS = 10000

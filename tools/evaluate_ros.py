@@ -1,0 +1,184 @@
+"""Success of policies in the ROS graph, in the same episodes as `tools.evaluate` without ROS."""
+
+from functools import partial
+import json
+from pathlib import Path
+from typing import Any
+
+from metagcttt.commander import NoAnswerError
+from metagcttt_core import FilterConfig, normalized_auc, success_statistics, TTTConfig
+from metagcttt_core.evaluation.rollout import episode_seed
+from metagcttt_core.files import atomic_write
+import numpy as np
+from pydantic import Field, model_validator
+from sim_bridge import make_simulator
+
+from tools.cli import fail, parse
+from tools.evaluate import environment_of, EpisodeSettings, format_table
+from tools.graph_drive import drive_arms
+from tools.maze_client import GoalOutcome, MazeClient
+from tools.node_process import NodeFailedError
+from tools.runs import provenance
+
+_DESCRIPTION = """Success of policies by test-time training budget, driven through the ROS graph.
+
+Example: python -m tools.evaluate_ros --preset antmaze-medium-navigate-study
+Simulator, goal node and policy node run as processes in lockstep, on the tasks and seeds of
+tools.evaluate: the same settings reach the same goals. Prints a table, writes OUT as JSON."""
+
+
+# Parameters of policy_node by the settings they stand for.
+_TTT_PARAMETERS = {
+    'lr': 'adapt_lr',
+    'batch_size': 'adapt_batch_size',
+    'early_stopping': 'early_stopping',
+    'test_fraction': 'test_fraction',
+    'actor_only': 'actor_only',
+    'horizon': 'horizon',
+}
+_FILTER_PARAMETERS = {
+    'variant': 'filter_variant',
+    'epsilon': 'epsilon',
+    'top_percent': 'top_percent',
+}
+
+
+class EvaluateRosSettings(EpisodeSettings):
+    """Settings of the tool."""
+
+    checkpoints: tuple[Path, ...] = Field(
+        (Path('out/pretrain/checkpoint'),), min_length=1, description='policies to evaluate'
+    )
+    timeout_s: float = Field(300.0, gt=0, description='longest wait for one goal, seconds')
+    out: Path = Field(
+        Path('out/evaluation-ros/evaluation.json'),
+        description='file for the results; logs of the nodes go beside it',
+    )
+
+    @model_validator(mode='after')
+    def _must_be_parameters(self) -> 'EvaluateRosSettings':
+        """What policy_node has no parameter for stays at its default."""
+        ttt = self.ttt.model_dump(include=set(_TTT_PARAMETERS) | {'steps'})
+        filtering = self.filter.model_dump(include=set(_FILTER_PARAMETERS))
+        for name, given, possible in (
+            ('ttt', self.ttt, TTTConfig(**ttt)),
+            ('filter', self.filter, FilterConfig(**filtering)),
+        ):
+            default = possible.model_dump()
+            for field, value in given.model_dump().items():
+                if value != default[field]:
+                    raise ValueError(
+                        f'{name}.{field}: policy_node has no such parameter and takes '
+                        f'{default[field]!r}, got {value!r}'
+                    )
+        return self
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run the tool."""
+    settings = parse(EvaluateRosSettings, _DESCRIPTION, 'evaluate', argv)
+    try:
+        results = evaluate_ros(settings)
+    except (NodeFailedError, NoAnswerError, ValueError) as error:
+        fail(str(error))
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None
+    report = {'settings': settings.model_dump(mode='json'), **provenance(), 'results': results}
+    with atomic_write(settings.out) as file:
+        file.write((json.dumps(report, indent=2) + '\n').encode())
+    print(format_table(results))
+    print('median adaptation, filter and inner loop (ms):')
+    for result in results:
+        times = ', '.join(
+            f'K = {point["budget"]}: {point["filter_ms"]:.0f} + {point["adapt_ms"]:.0f}'
+            for point in result['curve']
+        )
+        print(f'  {result["checkpoint"]}: {times}')
+    print(f'results: {settings.out}')
+
+
+def evaluate_ros(settings: EvaluateRosSettings) -> list[dict[str, Any]]:
+    """Success by policy and budget, as `tools.evaluate` has it, with the times of adaptations.
+
+    Raises:
+        ValueError: If checkpoints are damaged or for different environments.
+        NodeFailedError: If a node ends; with its log.
+        NoAnswerError: If a node does not answer in time.
+    """
+    environments = {environment_of(path) for path in settings.checkpoints}
+    if len(environments) > 1:
+        raise ValueError(f'checkpoints for one environment at a time, got {sorted(environments)}')
+    environment = environments.pop()
+    with make_simulator(environment) as simulator:
+        tasks = [task.task_id for task in simulator.tasks]
+    episodes = [
+        (seed, task, number)
+        for seed in settings.seeds
+        for task in tasks
+        for number in range(settings.episodes)
+    ]
+    world = {'environment': environment}
+    outcomes = drive_arms(
+        {
+            (path, budget): _parameters(settings, path, budget)
+            for path in settings.checkpoints
+            for budget in settings.budgets
+        },
+        [
+            partial(
+                MazeClient.drive,
+                task_id=task,
+                seed=episode_seed(seed, task, number),
+                timeout_s=settings.timeout_s,
+                as_task=True,
+            )
+            for seed, task, number in episodes
+        ],
+        logs=settings.out.parent / 'logs',
+        simulator=world,
+        goal_node={**world, 'dataset': str(settings.dataset)},
+    )
+    results = []
+    for path in settings.checkpoints:
+        curve = [
+            _point(settings, tasks, budget, outcomes[path, budget]) for budget in settings.budgets
+        ]
+        successes = [point['success'] for point in curve]
+        auc = normalized_auc(settings.budgets, successes) if len(curve) > 1 else None
+        results.append({'checkpoint': str(path), 'curve': curve, 'auc': auc})
+    return results
+
+
+def _parameters(
+    settings: EvaluateRosSettings, checkpoint: Path, budget: int
+) -> dict[str, bool | int | float | str]:
+    """Parameters of policy_node."""
+    chosen = {name: getattr(settings.ttt, field) for field, name in _TTT_PARAMETERS.items()}
+    chosen |= {name: getattr(settings.filter, field) for field, name in _FILTER_PARAMETERS.items()}
+    chosen['horizon'] = chosen['horizon'] or 0
+    files = {'checkpoint': str(checkpoint), 'dataset': str(settings.dataset)}
+    return {**files, **chosen, 'adapt_steps': budget, 'threads': 1}
+
+
+def _point(
+    settings: EvaluateRosSettings, tasks: list[int], budget: int, outcomes: list[GoalOutcome]
+) -> dict[str, Any]:
+    """One budget of one policy; outcomes are in the order of seeds, tasks and episodes."""
+    shape = (len(settings.seeds), len(tasks), settings.episodes)
+    reached = np.reshape([outcome.success for outcome in outcomes], shape)
+    per_seed = reached.mean(axis=(1, 2))
+    statistics = success_statistics(per_seed)
+    reports = [outcome.report for outcome in outcomes]
+    return {
+        'budget': budget,
+        'success': statistics.mean,
+        'standard_error': statistics.standard_error,
+        'per_seed': per_seed.tolist(),
+        'per_task': dict(zip(tasks, reached.mean(axis=(0, 2)).tolist(), strict=True)),
+        'filter_ms': float(np.median([report.filter_ms for report in reports])),
+        'adapt_ms': float(np.median([report.adapt_ms for report in reports])),
+    }
+
+
+if __name__ == '__main__':
+    main()
