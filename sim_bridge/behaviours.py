@@ -26,10 +26,19 @@ class Behaviour(ABC):
         goals_reached: How often the robot came to a goal it was after.
     """
 
-    def __init__(self, maze: MazeMap, rng: np.random.Generator) -> None:
-        """Draw the start: a free cell, and a place near its center."""
+    def __init__(self, maze: MazeMap, rng: np.random.Generator, to_goal: bool = False) -> None:
+        """Draw the start: a free cell, and a place near its center.
+
+        Args:
+            maze: Where to walk.
+            rng: Source of everything random.
+            to_goal: In the goal's cell, walk to the goal itself. OGBench walks to the cell's
+                center, and a robot that keeps to it well may linger there for long, beside the
+                goal.
+        """
         self.maze = maze
         self.rng = rng
+        self.to_goal = to_goal
         self.start_cell = self.draw(maze.free_cells())
         self.start_xy = self.near_center(self.start_cell)
         self.goals_reached = 0
@@ -61,19 +70,24 @@ class Behaviour(ABC):
 class _GoalSeeker(Behaviour):
     """Walks from cell to cell on the shortest way to a goal."""
 
-    def __init__(self, maze: MazeMap, rng: np.random.Generator) -> None:
+    def __init__(self, maze: MazeMap, rng: np.random.Generator, to_goal: bool = False) -> None:
         """Draw start and goal."""
-        super().__init__(maze, rng)
+        super().__init__(maze, rng, to_goal)
         self._goal_cell = self._draw_goal()
 
     def begin(self, simulator: Simulator) -> None:
         """Set the goal near the center of its cell."""
-        simulator.set_goal(self.near_center(self._goal_cell))
+        self._goal_xy = self.near_center(self._goal_cell)
+        simulator.set_goal(self._goal_xy)
 
     def direction(self, simulator: Simulator, row: int) -> Array:
-        """Unit vector to the center of the next cell; on arrival, of the goal's cell."""
+        """Unit vector to the center of the next cell; on arrival, of the goal's cell or to it."""
         position = simulator.position
-        target = self.maze.center(*self.maze.next_cell(self.maze.cell(*position), self._goal_cell))
+        cell = self.maze.cell(*position)
+        if self.to_goal and cell == self._goal_cell:
+            target = self._goal_xy
+        else:
+            target = self.maze.center(*self.maze.next_cell(cell, self._goal_cell))
         return _unit(np.subtract(target, position))
 
     @abstractmethod

@@ -45,16 +45,18 @@ def record_episode(
     num_rows: int,
     noise: float,
     rng: np.random.Generator,
+    to_goal: bool = False,
 ) -> Episode:
     """Run the behaviour policy for one episode of `num_rows` rows.
 
     At every row the follower gets the unit vector the behaviour wants to walk along; Gaussian
-    noise of standard deviation `noise` is added to its action, and the sum is cut to -1 to 1.
+    noise of standard deviation `noise` is added to its action, and the sum is cut to -1 to 1. With
+    `to_goal` it walks to the goals themselves, not to the centers of their cells.
 
     Source: OGBench, `data_gen_scripts/generate_locomaze.py`. Deviation: the action of the last
     row is recorded but not simulated, because nothing records where it leads.
     """
-    behaviour = BEHAVIOURS[kind](simulator.maze, rng)
+    behaviour = BEHAVIOURS[kind](simulator.maze, rng, to_goal)
     observation = simulator.reset_free(seed=int(rng.integers(2**32)), start_xy=behaviour.start_xy)
     behaviour.begin(simulator)
 

@@ -150,7 +150,8 @@ def _settings(plan: GenerationPlan, follower: DirectionFollower) -> dict[str, An
         {'controller_sha256': follower.sha256} if isinstance(follower, LearnedFollower) else {}
     )
     versions = {f'{package}_version': version(package) for package in PHYSICS_PACKAGES}
-    return {'format_version': FORMAT_VERSION, **plan.model_dump(), **controller, **versions}
+    settings = plan.model_dump(exclude_defaults=True)
+    return {'format_version': FORMAT_VERSION, **settings, **controller, **versions}
 
 
 def _refuse_existing(paths: OutputPaths) -> None:

@@ -25,6 +25,7 @@ class GenerationPlan(BaseModel):
     rows_per_episode: int = Field(ge=2, description='Rows of an episode; transitions plus one.')
     noise: float = Field(ge=0, description='Standard deviation of the action noise.')
     seed: int = Field(ge=0, description='Seed of everything random.')
+    to_goal: bool = Field(False, description="Walk to the goal, not to its cell's center.")
 
     @property
     def validation_episodes(self) -> int:
@@ -44,6 +45,7 @@ def plan_dataset(
     episodes: int | None = None,
     rows_per_episode: int | None = None,
     noise: float | None = None,
+    to_goal: bool = False,
 ) -> GenerationPlan:
     """Plan a dataset, with OGBench's size and noise where nothing else is asked for.
 
@@ -62,7 +64,9 @@ def plan_dataset(
     usual = _ogbench_size(name if '_' not in name else 'pointmaze-medium-v0', kind)
     asked = {'episodes': episodes, 'rows_per_episode': rows_per_episode, 'noise': noise}
     given = {key: value for key, value in asked.items() if value is not None}
-    return GenerationPlan(environment=name, kind=kind, seed=seed, **{**usual, **given})
+    return GenerationPlan(
+        environment=name, kind=kind, seed=seed, to_goal=to_goal, **{**usual, **given}
+    )
 
 
 def _ogbench_size(name: str, kind: Kind) -> dict[str, Any]:

@@ -66,6 +66,7 @@ def _record(
             plan.rows_per_episode,
             plan.noise,
             episode_generator(plan.seed, chunk.validation, index),
+            plan.to_goal,
         )
         for index in range(chunk.start, chunk.stop)
     ]

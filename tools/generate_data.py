@@ -53,6 +53,10 @@ class GenerateSettings(Settings):
     noise: float | None = Field(
         None, ge=0, description="Standard deviation of the action noise; OGBench's by default."
     )
+    to_goal: bool = Field(
+        False,
+        description="Walk to the goal itself; OGBench walks to the center of the goal's cell.",
+    )
     seed: int = Field(0, ge=0, description='Seed of everything random.')
     output: Path | None = Field(
         None, description='Path ending in .npz; data/MAZE-KIND-v0.npz by default.'
@@ -90,6 +94,7 @@ def _run(settings: GenerateSettings) -> None:
         episodes=settings.episodes,
         rows_per_episode=settings.rows_per_episode,
         noise=settings.noise,
+        to_goal=settings.to_goal,
     )
     output = settings.output or default_output(plan.environment, plan.kind)
     with tqdm(unit=' episodes', desc=output.stem, delay=0.5) as bar:
