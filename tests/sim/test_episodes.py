@@ -57,6 +57,28 @@ def test_navigate_reaches_one_goal_after_another(built_point: Simulator) -> None
     assert record(built_point, 'navigate', 2).goals_reached <= 1
 
 
+@pytest.mark.parametrize('to_goal', [False, True])
+def test_on_arrival_the_way_is_to_the_center_or_to_the_goal(
+    built_point: Simulator, to_goal: bool
+) -> None:
+    behaviour = BEHAVIOURS['navigate'](built_point.maze, episode_generator(0, False, 0), to_goal)
+    center = built_point.maze.center(*behaviour._goal_cell)  # type: ignore[attr-defined]
+    behaviour.near_center = lambda cell: (center[0] + 1.0, center[1] - 1.0)  # type: ignore[method-assign]
+    built_point.reset_free(seed=0, start_xy=(center[0], center[1] - 1.0))
+    behaviour.begin(built_point)
+    expected = (1.0, 0.0) if to_goal else (0.0, 1.0)
+    np.testing.assert_allclose(behaviour.direction(built_point, 0), expected, atol=1e-4)
+    elsewhere = next(
+        cell
+        for cell in built_point.maze.free_cells()
+        if cell != behaviour._goal_cell  # type: ignore[attr-defined]
+    )
+    built_point.reset_free(seed=0, start_xy=built_point.maze.center(*elsewhere))
+    ahead = built_point.maze.next_cell(elsewhere, behaviour._goal_cell)  # type: ignore[attr-defined]
+    way = np.subtract(built_point.maze.center(*ahead), built_point.maze.center(*elsewhere))
+    np.testing.assert_allclose(behaviour.direction(built_point, 0), way / 4.0, atol=1e-4)
+
+
 def test_navigate_draws_goals_outside_corridors_only() -> None:
     maze = maze_map('pointmaze-medium-v0')
     drawn = set()

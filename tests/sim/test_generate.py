@@ -174,6 +174,14 @@ def test_resume_with_other_settings_is_refused_by_name(
         generate(asked, unfinished, resume=True)
 
 
+def test_walking_to_the_goals_is_another_dataset(tmp_path: Path) -> None:
+    plan = plan_dataset(MAZE, 'navigate', episodes=EPISODES, rows_per_episode=21)
+    generate(plan, tmp_path / 'maze.npz')
+    assert 'to_goal' not in json.loads((tmp_path / 'maze.json').read_text())
+    with pytest.raises(GenerationError, match='to_goal'):
+        generate(plan.model_copy(update={'to_goal': True}), tmp_path / 'maze.npz', resume=True)
+
+
 def test_resume_with_other_physics_is_refused_by_name(unfinished: Path) -> None:
     settings = unfinished.with_suffix('.partial') / 'settings.json'
     stored = json.loads(settings.read_text())
