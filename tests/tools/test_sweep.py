@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 
+from metagcttt_core.config import load_preset, preset_names
 import pytest
 from tests.core.builders import maze_walks
 from tools import sweep
@@ -47,6 +48,13 @@ def preset(tmp_path):
     }
     path.write_text(yaml.safe_dump(values, sort_keys=False))
     return path
+
+
+@pytest.mark.parametrize('name', [name for name in preset_names() if 'sweep' in load_preset(name)])
+def test_study_of_every_preset_can_be_run(name):
+    study = Study(SweepSettings.model_validate(load_preset(name)['sweep']))
+    assert len(study.pretraining) == 3
+    assert study.evaluations
 
 
 def study_of(preset, **different):
