@@ -1,11 +1,12 @@
 """Writing files so that a crash leaves the old content or the new, never a part."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+import json
 import os
 from pathlib import Path
 import tempfile
-from typing import IO
+from typing import Any, IO
 
 
 @contextmanager
@@ -26,3 +27,9 @@ def atomic_write(path: Path) -> Iterator[IO[bytes]]:
     except BaseException:
         os.unlink(temporary)
         raise
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write JSON with one key per line, whole or not at all."""
+    with atomic_write(path) as file:
+        file.write((json.dumps(content, indent=2) + '\n').encode())

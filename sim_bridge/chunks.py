@@ -7,10 +7,10 @@ import shutil
 from typing import Any
 import zipfile
 
+from metagcttt_core.files import atomic_write, write_json
 import numpy as np
 
 from sim_bridge.episodes import Episode
-from sim_bridge.files import atomic_file, write_json
 from sim_bridge.plan import GenerationPlan
 
 PER_ROW = ('observations', 'actions', 'qpos', 'qvel')
@@ -98,7 +98,7 @@ class ChunkFolder:
             for name in PER_ROW
         }
         goals = np.array([episode.goals_reached for episode in episodes])
-        with atomic_file(self.path / chunk.file_name) as temporary, temporary.open('wb') as file:
+        with atomic_write(self.path / chunk.file_name) as file:
             np.savez(file, allow_pickle=False, goals_reached=goals, **arrays)
 
     def read(self, chunk: Chunk) -> dict[str, np.ndarray]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from metagcttt_core.data import TrajectoryDataset
+from metagcttt_core.files import write_json
 import numpy as np
 
 from sim_bridge.chunks import (
@@ -19,7 +20,6 @@ from sim_bridge.chunks import (
     refuse_difference,
 )
 from sim_bridge.controllers import DirectionFollower, LearnedFollower, make_direction_follower
-from sim_bridge.files import write_json
 from sim_bridge.plan import GenerationPlan
 from sim_bridge.posture import count_falls
 from sim_bridge.registry import describe_environment

@@ -1,14 +1,13 @@
 """The main job: goals published on a topic make a robot filter, adapt and drive there."""
 
 from functools import partial
-import json
 from pathlib import Path
 from typing import Any
 
 from metagcttt.commander import NoAnswerError
 from metagcttt_core import TrajectoryDataset
 from metagcttt_core.config import assets_dir, Settings
-from metagcttt_core.files import atomic_write
+from metagcttt_core.files import write_json
 import numpy as np
 from pydantic import Field
 from sim_bridge import make_simulator
@@ -88,8 +87,7 @@ def report(settings: DemoSettings, outcomes: dict[str, list[GoalOutcome]]) -> No
             for arm, results in outcomes.items()
         },
     }
-    with atomic_write(settings.out / 'summary.json') as file:
-        file.write((json.dumps(summary, indent=2) + '\n').encode())
+    write_json(settings.out / 'summary.json', summary)
     dataset = TrajectoryDataset.load(assets_dir() / _ASSETS / 'dataset.npz')
     simulator = make_simulator(_ENVIRONMENT)
     last = list(outcomes.values())[-1]

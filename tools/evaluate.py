@@ -1,7 +1,6 @@
 """Success of policies by test-time training budget, over tasks, episodes and seeds."""
 
 from concurrent.futures import as_completed, ProcessPoolExecutor
-import json
 import multiprocessing
 from pathlib import Path
 import sys
@@ -20,7 +19,7 @@ from metagcttt_core import (
 )
 from metagcttt_core.agents.gciql import ActorLoss
 from metagcttt_core.config import Settings
-from metagcttt_core.files import atomic_write
+from metagcttt_core.files import write_json
 import numpy as np
 from pydantic import Field
 from sim_bridge import make_simulator
@@ -86,8 +85,7 @@ def main(argv: list[str] | None = None) -> None:
         print('interrupted; the same command with --resume goes on', file=sys.stderr)
         raise SystemExit(130) from None
     report = {'settings': settings.model_dump(mode='json'), **provenance(), 'results': results}
-    with atomic_write(settings.out) as file:
-        file.write((json.dumps(report, indent=2) + '\n').encode())
+    write_json(settings.out, report)
     print(format_table(results))
     print(f'results: {settings.out}')
 

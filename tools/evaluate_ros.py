@@ -1,14 +1,13 @@
 """Success of policies in the ROS graph, in the same episodes as `tools.evaluate` without ROS."""
 
 from functools import partial
-import json
 from pathlib import Path
 from typing import Any
 
 from metagcttt.commander import NoAnswerError
 from metagcttt_core import FilterConfig, normalized_auc, success_statistics, TTTConfig
 from metagcttt_core.evaluation.rollout import episode_seed
-from metagcttt_core.files import atomic_write
+from metagcttt_core.files import write_json
 import numpy as np
 from pydantic import Field, model_validator
 from sim_bridge import make_simulator
@@ -84,8 +83,7 @@ def main(argv: list[str] | None = None) -> None:
     except KeyboardInterrupt:
         raise SystemExit(130) from None
     report = {'settings': settings.model_dump(mode='json'), **provenance(), 'results': results}
-    with atomic_write(settings.out) as file:
-        file.write((json.dumps(report, indent=2) + '\n').encode())
+    write_json(settings.out, report)
     print(format_table(results))
     print('median adaptation, filter and inner loop (ms):')
     for result in results:

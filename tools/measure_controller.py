@@ -1,12 +1,11 @@
 """Measure how well a learned controller follows directions."""
 
-import json
 import math
 from pathlib import Path
 from typing import Any
 
 from metagcttt_core.config import Settings
-from metagcttt_core.files import atomic_write
+from metagcttt_core.files import write_json
 import numpy as np
 from pydantic import Field
 from sim_bridge.controllers import load_follower
@@ -59,8 +58,7 @@ def main(argv: list[str] | None = None) -> None:
         **provenance(),
         'directions': rows,
     }
-    with atomic_write(settings.out.with_suffix('.json')) as file:
-        file.write((json.dumps(report, indent=2) + '\n').encode())
+    write_json(settings.out.with_suffix('.json'), report)
     save(controller_picture(walks), settings.out.with_suffix('.png'))
     print(format_table(rows))
     print(f'results: {settings.out.with_suffix(".json")} and .png')

@@ -8,7 +8,7 @@ from typing import Any
 from metagcttt_core import normalized_auc, success_statistics
 from metagcttt_core.config import Settings
 from metagcttt_core.evaluation import adaptation_efficiency
-from metagcttt_core.files import atomic_write
+from metagcttt_core.files import write_json
 import numpy as np
 from pydantic import Field
 import tyro
@@ -43,8 +43,7 @@ def main(argv: list[str] | None = None) -> None:
         fail(str(error))
     out = settings.out or settings.study / 'report'
     out.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(out.with_suffix('.json')) as file:
-        file.write((json.dumps(report, indent=1) + '\n').encode())
+    write_json(out.with_suffix('.json'), report)
     text = format_report(report)
     out.with_suffix('.md').write_text(text, encoding='utf-8')
     save(success_curves(_panels(report['adaptations'])), out.with_suffix('.png'))

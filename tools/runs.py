@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
-import json
 import os
 from pathlib import Path
 import signal
@@ -14,7 +13,7 @@ import threading
 from typing import Any
 
 from metagcttt_core.config import Settings
-from metagcttt_core.files import atomic_write
+from metagcttt_core.files import write_json
 from metagcttt_core.meta.parallel import any_process, first_process
 from metagcttt_core.training.checkpoint import has_checkpoint, load_training_state
 from metagcttt_core.training.run import TrainingInterrupted, TrainingRun
@@ -185,8 +184,7 @@ def provenance() -> dict[str, Any]:
 def write_settings(folder: Path, settings: Settings) -> None:
     """The resolved settings, beside a run's results."""
     record = {'settings': settings.model_dump(mode='json'), **provenance()}
-    with atomic_write(folder / 'settings.json') as file:
-        file.write((json.dumps(record, indent=2) + '\n').encode())
+    write_json(folder / 'settings.json', record)
 
 
 def use_threads(count: int) -> None:

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 from metagcttt_core import MetaConfig, TTTConfig
 from metagcttt_core.config import Settings
-from metagcttt_core.files import atomic_write
+from metagcttt_core.files import write_json
 from pydantic import Field, model_validator
 from tqdm import tqdm
 import tyro
@@ -123,8 +123,7 @@ class Study:
         out = self.settings.out
         out.mkdir(parents=True, exist_ok=True)
         record = {'settings': self.settings.model_dump(mode='json'), **provenance()}
-        with atomic_write(out / 'study.json') as file:
-            file.write((json.dumps(record, indent=2) + '\n').encode())
+        write_json(out / 'study.json', record)
         pending = [run for run in self.evaluations.values() if not is_evaluated(run)]
         with stop_on_signal() as stop:
             processes = self.settings.processes

@@ -17,7 +17,7 @@ from torch import Tensor
 from metagcttt_core.agents import AGENTS
 from metagcttt_core.agents.agent import Agent
 from metagcttt_core.config.settings import error_lines, Settings
-from metagcttt_core.files import atomic_write
+from metagcttt_core.files import atomic_write, write_json
 
 FORMAT_VERSION = 1
 _INDEX = 'checkpoint.json'
@@ -101,8 +101,7 @@ def save_checkpoint(agent: Agent, path: str | Path, training: TrainingState | No
     )
     with atomic_write(folder / weights) as file:
         file.write(content)
-    with atomic_write(folder / _INDEX) as file:
-        file.write((json.dumps(index.model_dump(mode='json'), indent=2) + '\n').encode())
+    write_json(folder / _INDEX, index.model_dump(mode='json'))
     for old in folder.glob('weights-*.safetensors'):
         if old.name != weights:
             old.unlink()

@@ -6,13 +6,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, Self
 
+from metagcttt_core.files import atomic_write, write_json
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from safetensors import SafetensorError
 import safetensors.numpy
 
 from sim_bridge.controllers.follower import ControllerError
-from sim_bridge.files import atomic_file, write_json
 from sim_bridge.simulator import Array
 
 _INDEX = 'controller.json'
@@ -110,8 +110,8 @@ class LearnedFollower:
             sha256=self.sha256,
             metadata=self.metadata,
         )
-        with atomic_file(folder / index.weights) as temporary:
-            temporary.write_bytes(self._serialized())
+        with atomic_write(folder / index.weights) as file:
+            file.write(self._serialized())
         write_json(folder / _INDEX, index.model_dump())
         for old in folder.glob('weights-*.safetensors'):
             if old.name != index.weights:

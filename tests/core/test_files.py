@@ -1,6 +1,8 @@
-"""atomic_write: the old content or the new, never a part."""
+"""Files are whole: the old content or the new, never a part."""
 
-from metagcttt_core.files import atomic_write
+import json
+
+from metagcttt_core.files import atomic_write, write_json
 import pytest
 
 
@@ -48,3 +50,12 @@ def test_failing_block_makes_no_file(tmp_path):
     with pytest.raises(ValueError, match='no'), atomic_write(tmp_path / 'file'):
         raise ValueError('no')
     assert list(tmp_path.iterdir()) == []
+
+
+def test_json_that_cannot_be_written_leaves_the_old(tmp_path):
+    path = tmp_path / 'a' / 'file.json'
+    write_json(path, {'one': [1, 2.5], 'two': None})
+    assert json.loads(path.read_text()) == {'one': [1, 2.5], 'two': None}
+    with pytest.raises(TypeError):
+        write_json(path, {'one': object()})
+    assert json.loads(path.read_text())['two'] is None

@@ -1,14 +1,13 @@
 """How benchmark results are shown and kept."""
 
 from abc import ABC, abstractmethod
-import json
 import os
 from pathlib import Path
 import platform
 from typing import Any
 
 from metagcttt_core.config import Settings
-from metagcttt_core.files import atomic_write
+from metagcttt_core.files import write_json
 
 from tools.runs import provenance
 
@@ -42,5 +41,4 @@ def write_report(path: Path, settings: Settings, results: dict[str, Any]) -> Non
         'machine': {'processor': platform.machine(), 'cores': os.cpu_count()},
         'results': results,
     }
-    with atomic_write(path) as file:
-        file.write((json.dumps(report, indent=2) + '\n').encode())
+    write_json(path, report)

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from metagcttt_core import CheckpointError, load_checkpoint, save_checkpoint
+from metagcttt_core import CheckpointError, files, load_checkpoint, save_checkpoint
 from metagcttt_core.agents import AGENTS
 from metagcttt_core.training import checkpoint
 from metagcttt_core.training.checkpoint import has_checkpoint, load_training_state, TrainingState
@@ -333,7 +333,8 @@ def test_crash_while_saving_leaves_the_old_checkpoint(completed, moment, tmp_pat
         with atomic_write(path) as file:
             yield file if len(writes) <= completed else Dying(file)
 
-    monkeypatch.setattr(checkpoint, 'atomic_write', dying_write)
+    for module in (checkpoint, files):
+        monkeypatch.setattr(module, 'atomic_write', dying_write)
     with pytest.raises(Crash):
         saved_agent(tmp_path, seed=2, training=training_state(step=6))
     assert len(writes) == completed + 1
