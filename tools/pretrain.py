@@ -94,7 +94,7 @@ def _run(settings: PretrainSettings) -> None:
         mode='json', include={'agent', 'hidden', 'training', 'seed', 'threads'}
     )
     decisive |= settings.model_dump(include={'device', 'compiled'}, exclude_defaults=True)
-    precision = resolve_precision(settings.precision, agent.device)
+    precision = resolve_precision(settings.precision, agent)
     if precision != 'float32':
         decisive['precision'] = precision
     decisive['dataset'] = settings.dataset.name

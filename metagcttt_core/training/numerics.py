@@ -11,6 +11,8 @@ from metagcttt_core.agents.agent import Agent, TensorBatch
 Precision = Literal['float32', 'bfloat16', 'auto']
 LossFunction = Callable[[TensorBatch], tuple[Tensor, dict[str, Tensor]]]
 
+_BFLOAT16_MIN_UNITS = 256  # `tools.benchmark training`: at 128 units it costs
+
 
 # torch's own tanh dominates GELU on a processor; written with exp it costs a quarter.
 def _compile_options(device: torch.device) -> dict[str, Any] | None:
@@ -23,15 +25,20 @@ def _compile_options(device: torch.device) -> dict[str, Any] | None:
     }
 
 
-def resolve_precision(
-    precision: Precision, device: torch.device
-) -> Literal['float32', 'bfloat16']:
-    """`float32` or `bfloat16`; `auto` is bfloat16 where the device has matrix units for it."""
+def resolve_precision(precision: Precision, agent: Agent) -> Literal['float32', 'bfloat16']:
+    """`float32` or `bfloat16`; `auto` is bfloat16 where the agent's device gains by it.
+
+    It does where it has matrix units for bfloat16; a processor also needs layers wide enough for
+    products to outweigh the conversions.
+    """
     if precision != 'auto':
         return precision
-    if device.type == 'cuda':
-        return 'bfloat16' if torch.cuda.is_bf16_supported(including_emulation=False) else 'float32'
-    return 'bfloat16' if torch.cpu.get_capabilities().get('amx_bf16') else 'float32'
+    if agent.device.type == 'cuda':
+        gains = torch.cuda.is_bf16_supported(including_emulation=False)
+    else:
+        wide = min(agent.settings.hidden) >= _BFLOAT16_MIN_UNITS
+        gains = wide and torch.cpu.get_capabilities().get('amx_bf16', False)
+    return 'bfloat16' if gains else 'float32'
 
 
 def loss_function(
@@ -49,7 +56,7 @@ def loss_function(
     losses = agent.losses
     if compiled:
         losses = torch.compile(losses, options=_compile_options(agent.device))
-    if resolve_precision(precision, agent.device) == 'float32':
+    if resolve_precision(precision, agent) == 'float32':
         return losses
 
     def in_bfloat16(batch: TensorBatch) -> tuple[Tensor, dict[str, Tensor]]:

@@ -1,5 +1,7 @@
 """Other ways to compute a loss: bfloat16 under autocast, and compiled."""
 
+from types import SimpleNamespace
+
 from metagcttt_core import make_agent
 from metagcttt_core.data import GoalRelabeller
 from metagcttt_core.training import numerics
@@ -10,7 +12,7 @@ import pytest
 from tests.core.builders import assert_bit_equal, random_dataset, tiny_agent, weights_of
 import torch
 
-CPU, CUDA = torch.device('cpu'), torch.device('cuda')
+CUDA = torch.device('cuda')
 LEARNERS = pytest.mark.parametrize(
     ('name', 'settings'),
     [
@@ -78,14 +80,24 @@ def test_auto_is_bfloat16_where_the_device_has_matrix_units(has_matrix_units, mo
         torch.cuda, 'is_bf16_supported', lambda including_emulation: has_matrix_units
     )
     expected = 'bfloat16' if has_matrix_units else 'float32'
-    assert resolve_precision('auto', CPU) == resolve_precision('auto', CUDA) == expected
+    agent, _ = agent_and_batch('gcbc', {}, hidden=(256, 256))
+    assert resolve_precision('auto', agent) == expected
+    on_gpu = SimpleNamespace(device=CUDA, settings=agent.settings)
+    assert resolve_precision('auto', on_gpu) == expected
     for named in ('float32', 'bfloat16'):
-        assert resolve_precision(named, CPU) == named
+        assert resolve_precision(named, agent) == named
+
+
+def test_auto_is_float32_on_a_processor_for_narrow_layers(monkeypatch):
+    monkeypatch.setattr(torch.cpu, 'get_capabilities', lambda: {'amx_bf16': True})
+    agent, _ = agent_and_batch('gcbc', {}, hidden=(512, 128))
+    assert resolve_precision('auto', agent) == 'float32'
 
 
 def test_processor_that_reports_nothing_computes_in_float32(monkeypatch):
     monkeypatch.setattr(torch.cpu, 'get_capabilities', dict)
-    assert resolve_precision('auto', CPU) == 'float32'
+    agent, _ = agent_and_batch('gcbc', {}, hidden=(512,))
+    assert resolve_precision('auto', agent) == 'float32'
 
 
 def test_compiled_code_is_made_for_the_number_of_threads(monkeypatch):
