@@ -154,7 +154,7 @@ def success_curves(adaptations: Mapping[str, Mapping[str, Mapping[str, Any]]]) -
         if len(adaptations) > 1:
             axes.set_title(name)
         if len(arms) > 1:
-            axes.legend(loc='lower right', frameon=False)
+            axes.legend(loc='best', frameon=False)
     panels[0].set_ylabel('success')
     return figure
 

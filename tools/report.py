@@ -166,12 +166,14 @@ def _finite(ratio: float | None) -> float | str | None:
 def format_report(report: dict[str, Any]) -> str:
     """The tables as Markdown, with the commands that made them."""
     settings = report['study']['settings']
-    study = settings['out']
+    command = f'python -m tools.report {shlex.quote(settings["out"])}'
+    if report['threshold'] != ReportSettings().threshold:
+        command += f' --threshold {report["threshold"]:g}'
     parts = [
         'Success: mean over training seeds ± standard error.',
         '```\n'
         f'python -m tools.sweep --preset {settings["base"]}\n'
-        f'python -m tools.report {shlex.quote(study)}\n'
+        f'{command}\n'
         '```',
     ]
     for name, arms in report['adaptations'].items():
