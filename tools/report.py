@@ -171,10 +171,7 @@ def format_report(report: dict[str, Any]) -> str:
         command += f' --threshold {report["threshold"]:g}'
     parts = [
         'Success: mean over training seeds ± standard error.',
-        '```\n'
-        f'python -m tools.sweep --preset {settings["base"]}\n'
-        f'{command}\n'
-        '```',
+        f'```\npython -m tools.sweep --preset {settings["base"]}\n{command}\n```',
     ]
     for name, arms in report['adaptations'].items():
         parts += [f'## Success by steps of test-time training ({name})', _success_table(arms)]
