@@ -176,7 +176,11 @@ def test_control_period_holds_while_adapting(
 ) -> None:
     start_process('goal_node', dataset=dataset_file)
     start_process(
-        'policy_node', dataset=dataset_file, checkpoint=checkpoint_folder, adapt_steps=10000
+        'policy_node',
+        dataset=dataset_file,
+        checkpoint=checkpoint_folder,
+        adapt_steps=10000,
+        adapt_batch_size=10000,  # minutes, for any machine
     )
     record = Record(graph, ANY)
     states = graph.node.create_publisher(MazeState, 'state', ANY)

@@ -10,7 +10,7 @@ from metagcttt.adaptation_report import report_message
 from metagcttt.converters import action_message
 from metagcttt.deployment import Outcome
 from metagcttt.pilot import Command, Query, State
-from metagcttt.qos import COMMAND, EVENTS, keep_several, LATCHED
+from metagcttt.qos import COMMAND, EVENTS, keep_several, LATCHED, RECORDED_DEPTH
 
 STATUS_PERIOD_S = 0.2
 
@@ -28,7 +28,7 @@ class PolicyAnnouncer:
         self._node = node
         self._instance = instance
         self._actions = node.create_lifecycle_publisher(
-            ActionCommand, 'action', keep_several(COMMAND)
+            ActionCommand, 'action', keep_several(COMMAND, RECORDED_DEPTH)
         )
         self._reports = node.create_lifecycle_publisher(AdaptationReport, 'adaptation', EVENTS)
         self._statuses = node.create_lifecycle_publisher(PolicyStatus, 'policy_status', LATCHED)

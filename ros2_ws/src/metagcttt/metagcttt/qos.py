@@ -42,15 +42,19 @@ def state_profile(stepping: str) -> QoSProfile:
     return LATCHED if stepping == 'lockstep' else SENSOR
 
 
-def keep_several(profile: QoSProfile) -> QoSProfile:
-    """The same with a depth of 20, for one end of a topic on which every message counts.
+RECORDED_DEPTH = 1000
+"""Messages that wait for a recorder: in lockstep those of a second or more."""
+
+
+def keep_several(profile: QoSProfile, depth: int = 20) -> QoSProfile:
+    """The same with a larger depth, for one end of a topic on which every message counts.
 
     With a depth of 1 a newer message takes the place of one that was not read yet: a slow recorder
     would miss some, and of two senders one would not be noticed.
     """
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
-        depth=20,
+        depth=depth,
         reliability=profile.reliability,
         durability=profile.durability,
     )
@@ -62,7 +66,7 @@ def recording_profile(publishers: Sequence[QoSProfile]) -> QoSProfile:
     latched = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers)
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
-        depth=1000,
+        depth=RECORDED_DEPTH,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )

@@ -31,7 +31,15 @@ from metagcttt.health import Health
 from metagcttt.pacing import Pacer
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import SIM_BRIDGE_NODE
-from metagcttt.qos import COMMAND, EVENTS, keep_several, LATCHED, SENSOR, state_profile
+from metagcttt.qos import (
+    COMMAND,
+    EVENTS,
+    keep_several,
+    LATCHED,
+    RECORDED_DEPTH,
+    SENSOR,
+    state_profile,
+)
 from metagcttt.sim_health import SimMonitor
 from metagcttt.vectors import vector_fault
 
@@ -77,7 +85,7 @@ class SimBridgeNode(Node):
         self._paused = bool(self._settings['start_paused'])
         self._awaiting: NDArray[np.float64] | None = None  # lockstep: arrived while paused
 
-        profile = keep_several(state_profile(self._settings['stepping']))
+        profile = keep_several(state_profile(self._settings['stepping']), RECORDED_DEPTH)
         self._states = self.create_publisher(MazeState, 'state', profile)
         self._events = self.create_publisher(EpisodeEvent, 'episode', EVENTS)
         self._map = self.create_publisher(OccupancyGrid, 'map', LATCHED)
