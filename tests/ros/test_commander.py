@@ -59,14 +59,15 @@ def test_processes_drive_to_a_goal_and_end_it_when_they_go_down(
     queries = graph.collect(GoalQuery, 'goal')
     task = commander.set_task(1, timeout_s=60)
     goal = (task.goal_position.x, task.goal_position.y)
+    graph.wait(commander._reach_goal.server_is_ready, 'the goal node')
     result = commander.reach(goal, max_steps=20)
     assert (result.success, result.error_code) == (False, Result.TIMED_OUT)
     assert result.steps == 20
-    commander.set_task(1)
-    sent = commander.send(goal)
+    commander.set_task(1, timeout_s=60)
+    sent = commander.send(goal, timeout_s=60)
     graph.wait(lambda: sent.feedback and sent.feedback.adapted, 'the expert')
     assert goals.stop(signal_number=signal.SIGTERM) == 0
-    assert sent.result(5).error_code == Result.SHUTDOWN
+    assert sent.result(60).error_code == Result.SHUTDOWN
     assert not queries[-1].active
     commander.destroy_node()
 

@@ -22,7 +22,14 @@ from metagcttt.goals import Goal, goal_ending, GoalCatalog, Verdict
 from metagcttt.health import Health
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import GOAL_NODE
-from metagcttt.qos import COMMAND, EVENTS, LATCHED, state_profile
+from metagcttt.qos import (
+    COMMAND,
+    EVENTS,
+    keep_several,
+    LATCHED,
+    RECORDED_DEPTH,
+    state_profile,
+)
 from metagcttt.reach_goal_server import ReachGoalServer
 from metagcttt.state_order import StateOrder
 from metagcttt.vectors import vector_fault
@@ -65,6 +72,9 @@ class GoalNode(Node):
 
         self._say = GoalAnnouncer(self, self._settings['frame_id'])
         profile = state_profile(self._settings['stepping'])
+        if self._settings['stepping'] == 'lockstep':
+            # The world waits for the policy, not for this node, which has to see every step.
+            profile = keep_several(profile, RECORDED_DEPTH)
         self.create_subscription(
             MazeState,
             'state',

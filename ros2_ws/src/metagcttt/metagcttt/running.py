@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 import threading
+import time
 from typing import TypeVar
 
 import rclpy
@@ -13,7 +14,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from metagcttt.signals import ignore_signals, only_set
 
-FAREWELL_SPINS = 10
+FAREWELL_S = 0.3
 
 AnyNode = TypeVar('AnyNode', bound=Node)
 
@@ -63,7 +64,8 @@ def _spin(
         ignore_signals()
         if farewell is not None:
             farewell(node)
-            for _ in range(FAREWELL_SPINS):
-                executor.spin_once(timeout_sec=0.02)
+            end = time.monotonic() + FAREWELL_S
+            while (left := end - time.monotonic()) > 0:
+                executor.spin_once(timeout_sec=left)
         executor.shutdown()
         node.destroy_node()
