@@ -11,9 +11,9 @@ from metagcttt_interfaces.msg import AdaptationReport, EpisodeEvent, MazeState
 from metagcttt_interfaces.srv import SetTask
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-_RELIABLE = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
-_LATCHED = QoSProfile(
-    depth=10, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+# Also what a node said before it had discovered this program.
+_EVERY = QoSProfile(
+    depth=2000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
 
 
@@ -58,16 +58,16 @@ class MazeClient(RobotCommander):
         self._seen = _Watched()
         self._goal_pose = self.create_publisher(PoseStamped, 'goal_pose', 10)
         self.create_subscription(
-            MazeState, 'state', lambda state: self._seen.states.append(state), _RELIABLE
+            MazeState, 'state', lambda state: self._seen.states.append(state), _EVERY
         )
         self._events = self.create_subscription(
-            EpisodeEvent, 'episode', lambda event: self._seen.events.append(event), _RELIABLE
+            EpisodeEvent, 'episode', lambda event: self._seen.events.append(event), _EVERY
         )
         self._reports = self.create_subscription(
             AdaptationReport,
             'adaptation',
             lambda report: self._seen.reports.append(report),
-            _LATCHED,
+            _EVERY,
         )
 
     def wait_until_ready(self, timeout_s: float = 30.0) -> None:
