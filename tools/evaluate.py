@@ -1,5 +1,6 @@
 """Success of policies by test-time training budget, over tasks, episodes and seeds."""
 
+from collections.abc import Mapping, Sequence
 from concurrent.futures import as_completed, ProcessPoolExecutor
 import multiprocessing
 from pathlib import Path
@@ -111,21 +112,30 @@ def evaluate(settings: EvaluateSettings) -> list[dict[str, Any]]:
                 task: [rates[*key, seed, task] for seed in settings.seeds]
                 for task in range(1, num_tasks + 1)
             }
-            per_seed = np.mean(list(tasks.values()), axis=0)
-            statistics = success_statistics(per_seed)
-            curve.append(
-                {
-                    'budget': budget,
-                    'success': statistics.mean,
-                    'standard_error': statistics.standard_error,
-                    'per_seed': per_seed.tolist(),
-                    'per_task': {task: float(np.mean(values)) for task, values in tasks.items()},
-                }
-            )
-        successes = [point['success'] for point in curve]
-        auc = normalized_auc(settings.budgets, successes) if len(curve) > 1 else None
-        results.append({'checkpoint': str(path), 'curve': curve, 'auc': auc})
+            curve.append(success_point(budget, tasks))
+        results.append(success_curve(path, curve))
     return results
+
+
+def success_point(budget: int, rates: Mapping[int, Sequence[float]]) -> dict[str, Any]:
+    """Success of one policy with one budget, given its rates by task and seed."""
+    per_seed = np.mean(list(rates.values()), axis=0)
+    statistics = success_statistics(per_seed)
+    return {
+        'budget': budget,
+        'success': statistics.mean,
+        'standard_error': statistics.standard_error,
+        'per_seed': per_seed.tolist(),
+        'per_task': {task: float(np.mean(values)) for task, values in rates.items()},
+    }
+
+
+def success_curve(checkpoint: Path, curve: list[dict[str, Any]]) -> dict[str, Any]:
+    """The points of one policy with the area under them."""
+    budgets = [point['budget'] for point in curve]
+    successes = [point['success'] for point in curve]
+    auc = normalized_auc(budgets, successes) if len(curve) > 1 else None
+    return {'checkpoint': str(checkpoint), 'curve': curve, 'auc': auc}
 
 
 def format_table(results: list[dict[str, Any]]) -> str:

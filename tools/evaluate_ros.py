@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from metagcttt.commander import NoAnswerError
-from metagcttt_core import FilterConfig, normalized_auc, success_statistics, TTTConfig
+from metagcttt_core import FilterConfig, TTTConfig
 from metagcttt_core.evaluation.rollout import episode_seed
 from metagcttt_core.files import write_json
 import numpy as np
@@ -13,7 +13,13 @@ from pydantic import Field, model_validator
 from sim_bridge import make_simulator
 
 from tools.cli import fail, parse
-from tools.evaluate import environment_of, EpisodeSettings, format_table
+from tools.evaluate import (
+    environment_of,
+    EpisodeSettings,
+    format_table,
+    success_curve,
+    success_point,
+)
 from tools.graph_drive import drive_arms
 from tools.maze_client import GoalOutcome, MazeClient
 from tools.node_process import NodeFailedError
@@ -136,15 +142,16 @@ def evaluate_ros(settings: EvaluateRosSettings) -> list[dict[str, Any]]:
         simulator=world,
         goal_node={**world, 'dataset': str(settings.dataset)},
     )
-    results = []
-    for path in settings.checkpoints:
-        curve = [
-            _point(settings, tasks, budget, outcomes[path, budget]) for budget in settings.budgets
-        ]
-        successes = [point['success'] for point in curve]
-        auc = normalized_auc(settings.budgets, successes) if len(curve) > 1 else None
-        results.append({'checkpoint': str(path), 'curve': curve, 'auc': auc})
-    return results
+    return [
+        success_curve(
+            path,
+            [
+                _point(settings, tasks, budget, outcomes[path, budget])
+                for budget in settings.budgets
+            ],
+        )
+        for path in settings.checkpoints
+    ]
 
 
 def _parameters(
@@ -163,16 +170,10 @@ def _point(
 ) -> dict[str, Any]:
     """One budget of one policy; outcomes are in the order of seeds, tasks and episodes."""
     shape = (len(settings.seeds), len(tasks), settings.episodes)
-    reached = np.reshape([outcome.success for outcome in outcomes], shape)
-    per_seed = reached.mean(axis=(1, 2))
-    statistics = success_statistics(per_seed)
+    rates = np.reshape([outcome.success for outcome in outcomes], shape).mean(axis=2)
     reports = [outcome.report for outcome in outcomes]
     return {
-        'budget': budget,
-        'success': statistics.mean,
-        'standard_error': statistics.standard_error,
-        'per_seed': per_seed.tolist(),
-        'per_task': dict(zip(tasks, reached.mean(axis=(0, 2)).tolist(), strict=True)),
+        **success_point(budget, dict(zip(tasks, rates.T.tolist(), strict=True))),
         'filter_ms': float(np.median([report.filter_ms for report in reports])),
         'adapt_ms': float(np.median([report.adapt_ms for report in reports])),
     }
