@@ -4,8 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from difflib import get_close_matches
 
-from sim_bridge import ogbench_mazes, robotics_mazes
 from sim_bridge.maze_map import MazeMap
+from sim_bridge.mazes import ogbench, robotics
 from sim_bridge.simulator import MazeDescription, Simulator
 
 
@@ -28,16 +28,16 @@ class Family:
 
 FAMILIES: tuple[Family, ...] = (
     Family(
-        ogbench_mazes.names,
-        ogbench_mazes.canonical_name,
-        ogbench_mazes.describe,
-        ogbench_mazes.OGBenchMaze,
+        ogbench.names,
+        ogbench.canonical_name,
+        ogbench.describe,
+        ogbench.OGBenchMaze,
     ),
     Family(
-        robotics_mazes.names,
-        robotics_mazes.canonical_name,
-        robotics_mazes.describe,
-        robotics_mazes.RoboticsMaze,
+        robotics.names,
+        robotics.canonical_name,
+        robotics.describe,
+        robotics.RoboticsMaze,
     ),
 )
 

@@ -9,9 +9,9 @@ from metagcttt_core import TrajectoryDataset
 from metagcttt_core.config import Settings
 from pydantic import Field
 from sim_bridge import describe_environment
-from sim_bridge.behaviours import Kind
-from sim_bridge.generate import generate, OutputPaths
-from sim_bridge.plan import plan_dataset
+from sim_bridge.generation.behaviours import Kind
+from sim_bridge.generation.generate import generate, OutputPaths
+from sim_bridge.generation.plan import plan_dataset
 from tqdm import tqdm
 
 from tools.cli import fail, parse

@@ -11,7 +11,7 @@ from pydantic import Field
 from sim_bridge.controllers import load_follower
 from sim_bridge.controllers.direction import BUNDLED
 from sim_bridge.controllers.walk import Walk, walk_along
-from sim_bridge.ogbench_layouts import UNIT_M
+from sim_bridge.mazes.ogbench_layouts import UNIT_M
 from tqdm import tqdm
 
 from tools.cli import fail, parse

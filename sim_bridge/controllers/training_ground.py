@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sim_bridge.rendering import choose_opengl_library
+from sim_bridge.opengl import choose_opengl_library
 from sim_bridge.simulator import Array
 
 Robot = Literal['ant', 'humanoid']

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from sim_bridge.controllers.learned import LearnedFollower
-from sim_bridge.posture import count_falls
-from sim_bridge.rendering import choose_opengl_library
+from sim_bridge.controllers.posture import count_falls
+from sim_bridge.opengl import choose_opengl_library
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 from sim_bridge import make_simulator, Simulator
-from sim_bridge.rendering import choose_opengl_library
+from sim_bridge.opengl import choose_opengl_library
 
 # Test files import MuJoCo themselves, and it reads the choice only once.
 choose_opengl_library()

@@ -10,9 +10,9 @@ from metagcttt_core import TrajectoryDataset, TrajectoryFilter
 from metagcttt_core.agents.gciql import GCIQL, GCIQLSettings
 import numpy as np
 from pydantic import Field
-from sim_bridge.behaviours import Kind
-from sim_bridge.generate import generate
-from sim_bridge.plan import plan_dataset
+from sim_bridge.generation.behaviours import Kind
+from sim_bridge.generation.generate import generate
+from sim_bridge.generation.plan import plan_dataset
 import torch
 from tqdm import tqdm
 

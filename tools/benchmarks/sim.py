@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 from sim_bridge import make_simulator
-from sim_bridge.gym_maze import GymMaze
+from sim_bridge.mazes.gym_maze import GymMaze
 from tqdm import tqdm
 
 from tools.benchmarks.report import Benchmark, markdown_table, write_report

@@ -13,11 +13,11 @@ from metagcttt_core.data import TrajectoryDataset
 import numpy as np
 from ogbench.utils import load_dataset
 import pytest
-from sim_bridge import plan as plan_module
-from sim_bridge.chunks import GenerationError, plan_chunks
 from sim_bridge.controllers import ControllerError
-from sim_bridge.generate import generate, Progress
-from sim_bridge.plan import GenerationPlan, plan_dataset
+from sim_bridge.generation import plan as plan_module
+from sim_bridge.generation.chunks import GenerationError, plan_chunks
+from sim_bridge.generation.generate import generate, Progress
+from sim_bridge.generation.plan import GenerationPlan, plan_dataset
 
 pytestmark = pytest.mark.mujoco
 MAZE = 'pointmaze-medium-v0'
@@ -253,8 +253,8 @@ SCRIPT = f"""
 if __name__ == '__main__':
     from pathlib import Path
     import sys
-    from sim_bridge import plan
-    from sim_bridge.generate import generate
+    from sim_bridge.generation import plan
+    from sim_bridge.generation.generate import generate
 
     plan.CHUNK_ROWS = 42
     asked = plan.plan_dataset('{MAZE}', 'navigate', episodes={EPISODES}, rows_per_episode=21)
@@ -272,7 +272,7 @@ def signal_in_the_middle(output: Path, number: signal.Signals) -> tuple[list[int
     output.parent.mkdir()
     script = output.parent.with_suffix('.py')
     script.write_text(SCRIPT)
-    root = Path(plan_module.__file__).parents[1]
+    root = Path(plan_module.__file__).parents[2]
     process = subprocess.Popen(
         [sys.executable, str(script), str(output)],
         env={**os.environ, 'PYTHONPATH': str(root), 'OMP_NUM_THREADS': '1'},

@@ -4,7 +4,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from sim_bridge.behaviours import Kind
+from sim_bridge.generation.behaviours import Kind
 from sim_bridge.registry import describe_environment
 
 CHUNK_ROWS = 20_000

@@ -10,8 +10,8 @@ import zipfile
 from metagcttt_core.files import atomic_write, write_json
 import numpy as np
 
-from sim_bridge.episodes import Episode
-from sim_bridge.plan import GenerationPlan
+from sim_bridge.generation.episodes import Episode
+from sim_bridge.generation.plan import GenerationPlan
 
 PER_ROW = ('observations', 'actions', 'qpos', 'qvel')
 _SETTINGS = 'settings.json'

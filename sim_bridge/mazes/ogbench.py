@@ -10,16 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from sim_bridge.gym_maze import check_seed, GymMaze
 from sim_bridge.maze_map import MazeMap
-from sim_bridge.ogbench_layouts import (
+from sim_bridge.mazes.gym_maze import check_seed, GymMaze
+from sim_bridge.mazes.ogbench_layouts import (
     LAYOUTS,
     ORIGIN_XY,
     ROBOTS,
     TASK_CELLS,
     UNIT_M,
 )
-from sim_bridge.rendering import choose_opengl_library
+from sim_bridge.opengl import choose_opengl_library
 from sim_bridge.simulator import Array, MazeDescription, SimulatorSpec, Task
 
 _DATASET_NAME = re.compile(r'(?P<maze>\w+-\w+)-(navigate|stitch|explore)-v0')

@@ -7,8 +7,8 @@ import numpy as np
 import ogbench.locomaze  # registers the environments  # noqa: F401
 import pytest
 from sim_bridge import describe_environment
-from sim_bridge.behaviours import NOISE
-from sim_bridge.ogbench_mazes import names
+from sim_bridge.generation.behaviours import NOISE
+from sim_bridge.mazes.ogbench import names
 
 pytestmark = pytest.mark.mujoco
 

@@ -9,9 +9,9 @@ import gymnasium_robotics
 import numpy as np
 import pytest
 from sim_bridge import describe_environment
-from sim_bridge.behaviours import NOISE
-from sim_bridge.robotics_layouts import flip
-from sim_bridge.robotics_mazes import names
+from sim_bridge.generation.behaviours import NOISE
+from sim_bridge.mazes.robotics import names
+from sim_bridge.mazes.robotics_layouts import flip
 
 pytestmark = [pytest.mark.mujoco, pytest.mark.filterwarnings('ignore:.*out of date')]
 gymnasium.register_envs(gymnasium_robotics)

@@ -11,7 +11,9 @@ from metagcttt_core.data import TrajectoryDataset
 from metagcttt_core.files import write_json
 import numpy as np
 
-from sim_bridge.chunks import (
+from sim_bridge.controllers import DirectionFollower, LearnedFollower, make_direction_follower
+from sim_bridge.controllers.posture import count_falls
+from sim_bridge.generation.chunks import (
     Chunk,
     ChunkFolder,
     GenerationError,
@@ -19,11 +21,9 @@ from sim_bridge.chunks import (
     plan_chunks,
     refuse_difference,
 )
-from sim_bridge.controllers import DirectionFollower, LearnedFollower, make_direction_follower
-from sim_bridge.plan import GenerationPlan
-from sim_bridge.posture import count_falls
+from sim_bridge.generation.plan import GenerationPlan
+from sim_bridge.generation.workers import record_chunks
 from sim_bridge.registry import describe_environment
-from sim_bridge.workers import record_chunks
 
 FORMAT_VERSION = 1
 PHYSICS_PACKAGES = ('mujoco', 'numpy', 'ogbench')

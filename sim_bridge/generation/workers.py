@@ -11,10 +11,10 @@ from pathlib import Path
 import signal
 import threading
 
-from sim_bridge.chunks import Chunk, ChunkFolder, GenerationError
 from sim_bridge.controllers import DirectionFollower, make_direction_follower
-from sim_bridge.episodes import episode_generator, record_episode
-from sim_bridge.plan import GenerationPlan
+from sim_bridge.generation.chunks import Chunk, ChunkFolder, GenerationError
+from sim_bridge.generation.episodes import episode_generator, record_episode
+from sim_bridge.generation.plan import GenerationPlan
 from sim_bridge.registry import make_simulator
 from sim_bridge.simulator import Simulator
 

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bridge.gym_maze import check_seed, GymMaze
 from sim_bridge.maze_map import Cell
-from sim_bridge.rendering import choose_opengl_library
-from sim_bridge.robotics_layouts import (
+from sim_bridge.mazes.gym_maze import check_seed, GymMaze
+from sim_bridge.mazes.robotics_layouts import (
     flip,
     LAYOUTS,
     plan_of,
@@ -20,6 +19,7 @@ from sim_bridge.robotics_layouts import (
     SUCCESS_M,
     task_cells,
 )
+from sim_bridge.opengl import choose_opengl_library
 from sim_bridge.simulator import Array, MazeDescription, SimulatorSpec, Task
 
 _PICTURE_PIXELS = 200

@@ -6,7 +6,7 @@ import sys
 import mujoco
 import numpy as np
 import pytest
-from sim_bridge import make_simulator, rendering, SimulatorError
+from sim_bridge import make_simulator, opengl, SimulatorError
 
 VARIABLES = ('MUJOCO_GL', 'DISPLAY', 'WAYLAND_DISPLAY')
 
@@ -23,12 +23,12 @@ def headless(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def have_libraries(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
     monkeypatch.setattr(
-        rendering.ctypes.util, 'find_library', lambda name: name if name in names else None
+        opengl.ctypes.util, 'find_library', lambda name: name if name in names else None
     )
 
 
 def choice() -> dict[str, str]:
-    rendering.choose_opengl_library()
+    opengl.choose_opengl_library()
     return {name: os.environ[name] for name in VARIABLES if name in os.environ}
 
 

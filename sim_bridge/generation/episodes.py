@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim_bridge.behaviours import BEHAVIOURS, Kind
 from sim_bridge.controllers import DirectionFollower
+from sim_bridge.generation.behaviours import BEHAVIOURS, Kind
 from sim_bridge.simulator import Simulator
 
 

@@ -12,7 +12,7 @@ import gymnasium_robotics
 import numpy as np
 import pytest
 from sim_bridge import make_simulator, Simulator, SimulatorError
-from sim_bridge.robotics_layouts import flip
+from sim_bridge.mazes.robotics_layouts import flip
 
 pytestmark = [pytest.mark.mujoco, pytest.mark.filterwarnings('ignore:.*out of date')]
 gymnasium.register_envs(gymnasium_robotics)

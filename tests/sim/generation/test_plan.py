@@ -2,8 +2,8 @@
 
 from pydantic import ValidationError
 import pytest
-from sim_bridge.behaviours import Kind
-from sim_bridge.plan import plan_dataset
+from sim_bridge.generation.behaviours import Kind
+from sim_bridge.generation.plan import plan_dataset
 
 
 @pytest.mark.parametrize(

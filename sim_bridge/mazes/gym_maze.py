@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sim_bridge.rendering import rendering_help
+from sim_bridge.opengl import rendering_help
 from sim_bridge.simulator import (
     Array,
     MazeDescription,

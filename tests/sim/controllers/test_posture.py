@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from sim_bridge.posture import count_falls, uprightness
+from sim_bridge.controllers.posture import count_falls, uprightness
 
 
 def pose(lean_rad: float, yaw_rad: float = 0.0) -> np.ndarray:

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from sim_bridge import maze_map, Simulator
-from sim_bridge.behaviours import BEHAVIOURS, Kind, Stitch
 from sim_bridge.controllers import PointFollower
-from sim_bridge.episodes import Episode, episode_generator, record_episode
+from sim_bridge.generation.behaviours import BEHAVIOURS, Kind, Stitch
+from sim_bridge.generation.episodes import Episode, episode_generator, record_episode
 from sim_bridge.maze_map import Cell, MazeMap
 
 pytestmark = pytest.mark.mujoco

@@ -7,8 +7,8 @@ The tables restate `gymnasium_robotics/envs/maze/maps.py` and the package's regi
 from dataclasses import dataclass
 
 from sim_bridge.maze_map import Cell, MazeMap
-from sim_bridge.ogbench_layouts import LAYOUTS as OGBENCH_LAYOUTS
-from sim_bridge.ogbench_layouts import TASK_CELLS as OGBENCH_TASK_CELLS
+from sim_bridge.mazes.ogbench_layouts import LAYOUTS as OGBENCH_LAYOUTS
+from sim_bridge.mazes.ogbench_layouts import TASK_CELLS as OGBENCH_TASK_CELLS
 
 SUCCESS_M = 0.45
 

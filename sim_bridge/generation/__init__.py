@@ -1,0 +1,1 @@
+"""Generation of offline datasets: plan, behaviour policies, episodes, resumable chunks."""

@@ -1,0 +1,1 @@
+"""The mazes of OGBench and gymnasium-robotics behind the simulator interface."""
