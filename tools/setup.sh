@@ -110,6 +110,8 @@ build_workspace() {
   # Left by a build that did not end: what it wrote may be half a file.
   [ ! -f "$stamps/building" ] || rm -rf "$workspace"/{build,install,log}
   rm -f "$stamps/workspace"
+  # colcon copies the package of Python modules and leaves those that were renamed or removed.
+  rm -rf "$workspace"/{build,install}/metagcttt
   touch "$stamps/building"
   mkdir -p "$workspace/log"
   say 'building the ROS workspace'

@@ -2,7 +2,7 @@
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from metagcttt.converters import to_time
-from metagcttt.policy_node import PolicyNode
+from metagcttt.policy.node import PolicyNode
 from metagcttt_interfaces.msg import GoalQuery, MazeState
 from rclpy.node import Node
 from rclpy.publisher import Publisher

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from metagcttt.commander import RobotCommander
-from metagcttt.goal_node import GoalNode
+from metagcttt.goal.node import GoalNode
 from metagcttt_interfaces.msg import EpisodeEvent, MazeState, PolicyStatus
 
 from tests.ros.graph import EVERY, Graph, Record

@@ -1,6 +1,6 @@
 """A policy node whose simulator and goal node the test plays."""
 
-from metagcttt.policy_node import PolicyNode
+from metagcttt.policy.node import PolicyNode
 from metagcttt_core import load_checkpoint
 from metagcttt_interfaces.msg import GoalQuery, MazeState
 from rclpy.parameter import Parameter

@@ -1,4 +1,3 @@
-from metagcttt.adaptation_report import report_message
 from metagcttt.converters import (
     action_message,
     occupancy_grid,
@@ -8,6 +7,7 @@ from metagcttt.converters import (
     to_point,
     to_time,
 )
+from metagcttt.policy.adaptation_report import report_message
 from metagcttt_core import Adaptation, make_agent, SupportSet
 from metagcttt_interfaces.msg import MazeState
 import numpy as np

@@ -1,9 +1,9 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from metagcttt.goal_node import GoalNode
-from metagcttt.policy_node import PolicyNode
-from metagcttt.sim_bridge_node import SimBridgeNode
+from metagcttt.goal.node import GoalNode
+from metagcttt.policy.node import PolicyNode
+from metagcttt.sim.node import SimBridgeNode
 from metagcttt_core import (
     FilterConfig,
     load_checkpoint,

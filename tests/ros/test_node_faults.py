@@ -5,9 +5,9 @@ from itertools import permutations
 from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray
-from metagcttt.goal_node import GoalNode
-from metagcttt.policy_node import PolicyNode
-from metagcttt.sim_bridge_node import SimBridgeNode
+from metagcttt.goal.node import GoalNode
+from metagcttt.policy.node import PolicyNode
+from metagcttt.sim.node import SimBridgeNode
 from metagcttt_interfaces.action import ReachGoal
 from metagcttt_interfaces.msg import ActionCommand, EpisodeEvent, GoalQuery, MazeState
 import pytest

@@ -5,7 +5,7 @@ from pathlib import Path
 import re
 
 from metagcttt.parameters import TABLES
-from metagcttt.sim_bridge_node import SimBridgeNode
+from metagcttt.sim.node import SimBridgeNode
 from metagcttt_core import make_agent, save_checkpoint
 from metagcttt_interfaces.action import ReachGoal
 from metagcttt_interfaces.msg import ActionCommand, MazeState

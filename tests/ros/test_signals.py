@@ -51,7 +51,7 @@ from metagcttt import main
 
 class Compiled:
     def find_spec(self, name, path, target=None):
-        if name == 'metagcttt.goal_node':
+        if name == 'metagcttt.goal.node':
             try:
                 signal.raise_signal(signal.SIGTERM)
             except SystemExit:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from sim_bridge import MazeMap
 from std_msgs.msg import Header
 
-from metagcttt.goals import Goal
+from metagcttt.goal.goals import Goal
 
 OCCUPIED = 100
 FREE = 0

@@ -2,43 +2,78 @@
 
 from collections.abc import Callable
 import gc
-from importlib import import_module
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from metagcttt.signals import stop_on_signals
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
 
 
 def goal_node() -> int:
     """Run the goal node until Ctrl-C or SIGTERM; returns the exit code."""
-    return _main('GoalNode', 'goal_node', farewell=lambda node: node.end_service())
+
+    def load() -> Callable[[], 'Node']:
+        from metagcttt.goal.node import GoalNode
+
+        return GoalNode
+
+    return _main(load, farewell=lambda node: node.end_service())
 
 
 def policy_node() -> int:
     """Run the policy node until Ctrl-C or SIGTERM; returns the exit code."""
-    return _main('PolicyNode', 'policy_node')
+
+    def load() -> Callable[[], 'Node']:
+        from metagcttt.policy.node import PolicyNode
+
+        return PolicyNode
+
+    return _main(load)
 
 
 def recorder_node() -> int:
     """Run the recorder until Ctrl-C or SIGTERM; returns the exit code."""
-    return _main('RecorderNode', 'recorder_node')
+
+    def load() -> Callable[[], 'Node']:
+        from metagcttt.recorder.node import RecorderNode
+
+        return RecorderNode
+
+    return _main(load)
 
 
 def sim_bridge_node() -> int:
     """Run the simulator's bridge until Ctrl-C or SIGTERM; returns the exit code."""
-    return _main('SimBridgeNode', 'sim_bridge_node')
+
+    def load() -> Callable[[], 'Node']:
+        from metagcttt.sim.node import SimBridgeNode
+
+        return SimBridgeNode
+
+    return _main(load)
 
 
 def visualization_node() -> int:
-    """Run the node that makes what RViz shows until Ctrl-C or SIGTERM; returns the exit code."""
-    return _main('VisualizationNode', 'visualization_node')
+    """Run the visualization node until Ctrl-C or SIGTERM; returns the exit code."""
+
+    def load() -> Callable[[], 'Node']:
+        from metagcttt.visualization.node import VisualizationNode
+
+        return VisualizationNode
+
+    return _main(load)
 
 
-def _main(node: str, module: str, farewell: Callable[[Any], None] | None = None) -> int:
+def _main(
+    load: Callable[[], Callable[[], 'Node']], farewell: Callable[[Any], None] | None = None
+) -> int:
     stop = stop_on_signals()
     try:
-        node_type = getattr(import_module(f'metagcttt.{module}'), node)
-        run = import_module('metagcttt.running').run
-        return run(node_type, stop, farewell)
+        make_node = load()
+        from metagcttt.running import run
+
+        return run(make_node, stop, farewell)
     except ImportError:
         # Compiled modules turn what a signal raises into this.
         if not stop.is_set():

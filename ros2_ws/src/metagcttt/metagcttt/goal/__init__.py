@@ -1,0 +1,1 @@
+"""Goals on the graph: checks them, numbers them and decides when they are over."""

@@ -1,0 +1,1 @@
+"""The policy on the graph: filters, adapts for K steps per goal and acts."""

@@ -1,0 +1,102 @@
+"""How a policy is. No ROS in here."""
+
+from dataclasses import dataclass
+import time
+
+from metagcttt.health import Deadlines, Faults, Health, Level, Rate, Samples
+from metagcttt.policy.pilot import Query
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Thresholds above which a policy counts as degraded.
+
+    Attributes:
+        latency_ms: Of the 99th percentile of the time from a state's arrival to its action.
+        missed_deadlines: Control periods without an action in the last minute.
+        adapt_ms: Time that the last adaptation took.
+    """
+
+    latency_ms: float
+    missed_deadlines: int
+    adapt_ms: float
+
+
+class PolicyMonitor:
+    """Gathers figures while a policy runs and judges them."""
+
+    def __init__(self) -> None:
+        """Nothing has happened yet."""
+        self.states = Rate()
+        self.actions = Rate()
+        self.latency_ms = Samples()
+        self.adapt_ms = Samples(100)
+        self.deadlines = Deadlines()
+        self.faults = Faults()
+        self.remark = ''  # why the newest adaptation was not accepted
+
+    def examine(
+        self,
+        *,
+        acting: bool,
+        zero_reason: str,
+        query: Query | None,
+        num_publishers: int,
+        num_pending: int,
+        limits: Limits,
+    ) -> Health:
+        """The health now.
+
+        Args:
+            acting: Whether the node is active.
+            zero_reason: Why the action is zero although the node acts; empty when it is not.
+            query: The goal in force.
+            num_publishers: Of actions in the graph, this one included.
+            num_pending: Adaptations that have not ended.
+            limits: What is still healthy.
+        """
+        now_s = time.monotonic()
+        missed = self.deadlines.in_last_minute(now_s)
+        latency_ms = self.latency_ms.percentile(99)
+        base_reason = self.base_reason(query)
+        values = {
+            'state_rate_hz': f'{self.states.per_second(now_s):.1f}',
+            'action_rate_hz': f'{self.actions.per_second(now_s):.1f}',
+            'latency_median_ms': f'{self.latency_ms.percentile(50):.2f}',
+            'latency_p99_ms': f'{latency_ms:.2f}',
+            'missed_deadlines': str(self.deadlines.total),
+            'missed_deadlines_last_minute': str(missed),
+            'adapt_last_ms': f'{self.adapt_ms.last():.1f}',
+            'adapt_p99_ms': f'{self.adapt_ms.percentile(99):.1f}',
+            'adaptations_pending': str(num_pending),
+            'action_publishers': str(num_publishers),
+            **{kind: str(count) for kind, count in sorted(self.faults.counts.items())},
+        }
+        level, message = Level.OK, 'acting with the adapted policy'
+        if not acting:
+            message = 'not active'
+        elif zero_reason:
+            level, message = Level.ERROR, f'the action is zero: {zero_reason}'
+        elif recent := self.faults.recent(now_s):
+            level, message = Level.ERROR, f'just now: {recent}'
+        elif num_publishers > 1:
+            level, message = Level.WARN, f'{num_publishers} nodes publish actions'
+        elif latency_ms > limits.latency_ms:
+            level, message = Level.WARN, f'99 % of actions within {latency_ms:.1f} ms only'
+        elif missed > limits.missed_deadlines:
+            level, message = Level.WARN, f'{missed} deadlines missed in the last minute'
+        elif self.adapt_ms.last() > limits.adapt_ms:
+            level, message = Level.WARN, f'the adaptation took {self.adapt_ms.last():.0f} ms'
+        elif query is None:
+            message = 'no goal'
+        elif base_reason:
+            level, message = Level.WARN, f'acting with the base policy: {base_reason}'
+        return Health(level, message, values)
+
+    def base_reason(self, query: Query | None) -> str:
+        """Why the base policy serves a goal; empty when the expert does."""
+        if query is None or query.adapted:
+            return ''
+        if query.adapting:
+            return f'{query.steps_done} of {query.config.steps} gradient steps done'
+        return self.remark or 'no state to adapt to yet'

@@ -1,0 +1,129 @@
+"""The lifecycle of the policy; what it does while active is in `policy_session`."""
+
+import secrets
+from typing import Any
+
+from metagcttt_core import FilterConfig
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from std_srvs.srv import SetBool
+import torch
+
+from metagcttt.diagnostics import Diagnostics
+from metagcttt.health import Health, Level
+from metagcttt.parameter_set import ParameterSet
+from metagcttt.parameters import POLICY_NODE
+from metagcttt.policy.deployment import load_deployment
+from metagcttt.policy.session import PolicySession
+from metagcttt.policy.warm_up import warm_up
+
+
+class PolicyNode(LifecycleNode):
+    """Loads a policy and its dataset when configured, and acts on goals while active."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        """Declare the parameters and, with `autostart`, configure and activate.
+
+        Args:
+            kwargs: For `rclpy.node.Node`.
+        """
+        super().__init__('policy_node', **kwargs)
+        self._session: PolicySession | None = None
+        self._instance = secrets.randbits(64)
+        self._enabled = True
+        self._settings = ParameterSet(
+            self, POLICY_NODE, is_configured=lambda: self._session is not None
+        )
+        self.add_post_set_parameters_callback(self._on_parameters_set)
+        self.create_service(SetBool, 'enable', self._on_enable)
+        self._failure = ''  # of the newest configuration
+        self._diagnostics = Diagnostics(
+            self, self._examine, self._settings['diagnostics_period_s']
+        )
+        if self._settings['autostart']:
+            if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
+                self.trigger_activate()
+
+    def destroy_node(self) -> None:
+        """End the adaptation thread, then destroy the node."""
+        self._close_session()
+        super().destroy_node()
+        # rclpy forgets this one, and it keeps the node visible to others.
+        self._state_machine.destroy_when_not_in_use()
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Load policy and dataset, and connect; a failure leaves the node unconfigured."""
+        config = FilterConfig(
+            variant=self._settings['filter_variant'],
+            epsilon=self._settings['epsilon'],
+            top_percent=self._settings['top_percent'],
+        )
+        try:
+            deployment = load_deployment(
+                self._settings['checkpoint'], self._settings['dataset'], config
+            )
+            warm_up(deployment)
+        except (OSError, ValueError) as error:
+            # rclpy would swallow it without a word.
+            self._failure = f'cannot configure: {error}'
+            self.get_logger().error(self._failure)
+            return TransitionCallbackReturn.FAILURE
+        if self._settings['threads']:
+            torch.set_num_threads(self._settings['threads'])
+        self._failure = ''
+        self._session = PolicySession(
+            self, self._settings, deployment, instance=self._instance, enabled=self._enabled
+        )
+        agent, dataset = deployment.agent, deployment.dataset
+        self.get_logger().info(
+            f'{agent.name} policy for observations of {agent.obs_dim} and actions of '
+            f'{agent.act_dim} values; {dataset.num_episodes} trajectories, '
+            f'{dataset.num_transitions} transitions'
+        )
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Start acting."""
+        super().on_activate(state)  # publishers first
+        if self._session is not None:
+            self._session.start()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop acting, in realtime with a zero action."""
+        if self._session is not None:
+            self._session.stop()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Disconnect and free the policy and the dataset."""
+        self._close_session()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop and free everything, for good."""
+        self._close_session()
+        return TransitionCallbackReturn.SUCCESS
+
+    def _close_session(self) -> None:
+        if self._session is not None:
+            self._session.close()
+            self._session = None
+
+    def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self._enabled = request.data
+        if self._session is not None:
+            self._session.enable(self._enabled)
+        response.success = True
+        response.message = 'enabled' if self._enabled else 'disabled: every action is zero'
+        return response
+
+    def _examine(self) -> Health:
+        if self._session is not None:
+            return self._session.examine()
+        level = Level.ERROR if self._failure else Level.OK
+        return Health(level, self._failure or 'not configured')
+
+    def _on_parameters_set(self, parameters: list[Parameter]) -> None:
+        if self._session is not None and any(p.name == 'rate_hz' for p in parameters):
+            self._session.pace()

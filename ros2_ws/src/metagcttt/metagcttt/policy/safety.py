@@ -1,0 +1,70 @@
+"""When a policy has to keep the robot still. No ROS in here."""
+
+from metagcttt.policy.pilot import State
+from metagcttt.senders import Senders
+
+
+class Safety:
+    """Knows the reasons for a zero action; each ends when its cause is gone.
+
+    Attributes:
+        enabled: Whether the robot may move at all.
+        rivals: Other policies in the graph.
+        lost_goal: Why the goal in force was dropped; empty from the next goal on.
+    """
+
+    def __init__(self, *, enabled: bool) -> None:
+        """Nothing was heard yet."""
+        self.enabled = enabled
+        self.rivals = Senders()
+        self.lost_goal = ''
+        self._state_s = self._state_clock_s = float('inf')
+        self._lease_s = self._lease_end_s = float('inf')
+
+    def saw_state(self, now_s: float, clock_s: float) -> None:
+        """A state arrived.
+
+        Args:
+            now_s: The time now, seconds of a clock that only goes forward.
+            clock_s: The same by the node's clock, which may be simulated and stand still.
+        """
+        self._state_s, self._state_clock_s = now_s, clock_s
+
+    def state_age_s(self, now_s: float, clock_s: float) -> float:
+        """Seconds since the newest state, by the clock that went by faster."""
+        return max(now_s - self._state_s, clock_s - self._state_clock_s)
+
+    def saw_goal(self, now_s: float, lease_s: float) -> None:
+        """A goal arrived, or was repeated; without another message it holds for `lease_s`."""
+        self.lost_goal = ''
+        self._lease_s = lease_s
+        self._lease_end_s = now_s + lease_s if lease_s > 0 else float('inf')
+
+    def lose_goal(self, query_id: int, now_s: float) -> bool:
+        """Whether the goal in force is no longer repeated, as its node is gone."""
+        if now_s <= self._lease_end_s:
+            return False
+        self.lost_goal = f'goal {query_id} was not repeated for {self._lease_s:g} s and is dropped'
+        return True
+
+    def zero_reason(
+        self, state: State | None, *, now_s: float, clock_s: float, timeout_s: float
+    ) -> str:
+        """Why the robot may not move now; empty when it may.
+
+        Args:
+            state: The newest state.
+            now_s: See `saw_state`.
+            clock_s: See `saw_state`.
+            timeout_s: Oldest age of a state to act on, seconds.
+        """
+        age_s = self.state_age_s(now_s, clock_s)
+        if not self.enabled:
+            return 'disabled by the service enable'
+        if self.rivals.count(now_s):
+            return 'another policy node acts in this graph'
+        if self.lost_goal:
+            return self.lost_goal
+        if age_s > timeout_s:
+            return f'no state for {age_s:.1f} s'
+        return state.fault if state is not None else ''

@@ -1,0 +1,1 @@
+"""Recording of a robot's topics as MCAP."""

@@ -1,0 +1,1 @@
+"""Topics for RViz: odometry, path, goal, retrieved sub-trajectories and value."""

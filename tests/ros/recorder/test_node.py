@@ -1,0 +1,184 @@
+from collections.abc import Callable
+from pathlib import Path
+
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from metagcttt.recorder.node import RecorderNode
+from metagcttt.recorder.recording import (
+    message_class,
+    message_definition,
+    Recording,
+    UnknownTypeError,
+)
+from metagcttt.sim.node import SimBridgeNode
+from metagcttt_core import TrajectoryDataset
+from metagcttt_core.data.mcap import read_messages
+from metagcttt_core.data.recordings import STATE
+import numpy as np
+import pytest
+from std_msgs.msg import Float64, String
+from tests.ros.graph import ANY, EVERY, Graph, Record
+from tests.ros.test_lockstep_episode import drive, offline_episode, TTT
+from tools import recording_to_dataset
+from tools.node_process import NodeProcess
+
+
+def contents(path: Path) -> dict[str, list]:
+    """Decoded messages by topic, read as other programs do, through the file's index."""
+    messages: dict[str, list] = {}
+    with path.open('rb') as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        assert reader.get_header().profile == 'ros2'
+        for schema, channel, _, message in reader.iter_decoded_messages():
+            assert (schema.encoding, channel.message_encoding) == ('ros2msg', 'cdr')
+            messages.setdefault(channel.topic, []).append(message)
+    return messages
+
+
+def wait_until_recorded(graph: Graph, *topics: str) -> None:
+    for topic in topics:
+        graph.wait(
+            lambda topic=topic: any(
+                info.node_name == 'recorder_node'
+                for info in graph.node.get_subscriptions_info_by_topic(topic)
+            ),
+            f'the recorder at {topic}',
+            timeout_s=60,
+        )
+
+
+@pytest.mark.mujoco
+@pytest.mark.slow
+def test_recorded_lockstep_episode_is_the_offline_episode(
+    graph: Graph,
+    tmp_path: Path,
+    checkpoint_folder: Path,
+    dataset_file: Path,
+    start_process: Callable[..., NodeProcess],
+) -> None:
+    output, converted = tmp_path / 'run.mcap', tmp_path / 'run.npz'
+    files = {'dataset': dataset_file, 'stepping': 'lockstep'}
+    policy = {'checkpoint': checkpoint_folder, 'adaptation': 'hold', 'threads': 1, **TTT}
+    start_process('sim_bridge_node', stepping='lockstep')
+    start_process('goal_node', **files)
+    start_process('policy_node', **policy, **files)
+    recorder = start_process('recorder_node', output=output)
+    record = Record(graph, EVERY)
+    graph.wait_for_publishers()
+    wait_until_recorded(graph, '/state', '/action', '/goal', '/episode', '/adaptation', '/map')
+    graph.wait(lambda: graph.node.count_subscribers('goal') == 3, 'policy and recorder')
+    for task_id, seed in ((1, 3), (4, 8)):
+        drive(graph, record, task_id, seed)
+    # On a busy machine DDS loses packets and sends them again, at the latest after three seconds.
+    graph.wait_for(4.0)
+    assert recorder.stop() == 0
+
+    argv = ['--recordings', str(output), '--out', str(converted), '--refuse-gaps']
+    recording_to_dataset.main(argv)
+    dataset = TrajectoryDataset.load(converted)
+    expected = [
+        offline_episode(checkpoint_folder, dataset_file, task_id, seed)
+        for task_id, seed in ((1, 3), (4, 8))
+    ]
+    assert dataset.num_episodes == 2
+    for number, episode in enumerate(expected):
+        rows = slice(dataset.episode_starts[number], dataset.episode_ends[number] + 1)
+        np.testing.assert_array_equal(
+            dataset.observations[rows], episode.observations.astype(np.float32)
+        )
+        np.testing.assert_array_equal(dataset.actions[rows][:-1], episode.actions)
+
+    recorded = contents(output)
+    assert {'/state', '/action', '/goal', '/episode', '/adaptation', '/map', '/clock'} <= set(
+        recorded
+    )
+    assert len(recorded['/adaptation']) == 2
+    assert recorded['/map'][0].info.width == 8
+
+
+@pytest.mark.mujoco
+@pytest.mark.slow
+def test_killed_recorder_leaves_a_readable_file(
+    graph: Graph, tmp_path: Path, start_process: Callable[..., NodeProcess]
+) -> None:
+    output = tmp_path / 'run.mcap'
+    graph.add(SimBridgeNode, speed_factor=5.0)
+    recorder = start_process('recorder_node', output=output, flush_s=0.1)
+    wait_until_recorded(graph, '/state')
+    graph.wait(lambda: output.stat().st_size > 5000, 'the first chunks')
+    recorder.kill()
+    content = read_messages(output, [STATE])
+    assert not content.complete
+    steps = [recorded.message.step for recorded in content.messages]
+    assert len(steps) > 3
+    assert steps == list(range(steps[0], steps[0] + len(steps)))
+
+
+def test_recorder_takes_on_the_quality_of_the_publishers(graph: Graph, tmp_path: Path) -> None:
+    output = tmp_path / 'run.mcap'
+    recorder = graph.add(RecorderNode, output=str(output))
+    first = graph.node.create_publisher(Float64, 'number', EVERY)
+    first.publish(Float64(data=1.0))
+    graph.wait(lambda: recorder._recording.num_messages == 1, 'the latched message')
+    graph.node.destroy_publisher(first)
+    second = graph.node.create_publisher(Float64, 'number', ANY)
+    graph.wait(second.get_subscription_count, 'a subscription that fits')
+    second.publish(Float64(data=2.0))
+    graph.wait(lambda: recorder._recording.num_messages == 2, 'the second message')
+    graph.remove(recorder)
+    assert [message.data for message in contents(output)['/number']] == [1.0, 2.0]
+
+
+def test_recorder_in_a_namespace_leaves_other_robots_out(graph: Graph, tmp_path: Path) -> None:
+    output = tmp_path / 'run.mcap'
+    mine = graph.node.create_publisher(String, '/robot1/word', EVERY)
+    other = graph.node.create_publisher(String, '/robot10/word', EVERY)
+    shared = graph.node.create_publisher(String, '/diagnostics', EVERY)
+    for publisher in (mine, other, shared):
+        publisher.publish(String(data='here'))
+    recorder = graph.add(
+        lambda **kwargs: RecorderNode(namespace='robot1', **kwargs), output=str(output)
+    )
+    graph.wait(lambda: recorder._recording.num_messages == 2, 'two messages')
+    graph.remove(recorder)
+    assert contents(output).keys() == {'/robot1/word', '/diagnostics'}
+
+
+def test_recording_is_split_at_its_size(tmp_path: Path) -> None:
+    recording = Recording(tmp_path / 'run.mcap', split_bytes=4000)
+    recording.add_topic('/word', 'std_msgs/msg/String')
+    rng = np.random.default_rng(0)
+    text = b'\x00\x01\x00\x00\x65\x00\x00\x00'
+    for time in range(100):
+        letters = rng.integers(97, 123, 100).astype(np.uint8).tobytes()
+        recording.add('/word', text + letters + b'\x00', log_time=time, publish_time=time)
+        recording.flush()
+    recording.close()
+    assert [path.name for path in recording.paths[:3]] == [
+        'run.mcap',
+        'run_1.mcap',
+        'run_2.mcap',
+    ]
+    counts = [len(contents(path)['/word']) for path in recording.paths]
+    assert sum(counts) == recording.num_messages == 100
+
+
+def test_recording_never_overwrites_a_file(tmp_path: Path) -> None:
+    path = tmp_path / 'run.mcap'
+    path.write_bytes(b'precious')
+    with pytest.raises(FileExistsError, match=r'run\.mcap'):
+        Recording(path)
+    assert path.read_bytes() == b'precious'
+
+
+def test_definition_holds_every_type_in_a_message() -> None:
+    text = message_definition('metagcttt_interfaces/msg/MazeState')
+    assert text.startswith('# What the simulator knows')
+    for name in ('std_msgs/Header', 'builtin_interfaces/Time', 'geometry_msgs/Point'):
+        assert text.count(f'{"=" * 80}\nMSG: {name}\n') == 1
+
+
+@pytest.mark.parametrize('name', ['std_srvs/srv/Trigger', 'nowhere/msg/Thing', 'std_msgs/msg/No'])
+def test_unknown_type_is_refused_by_name(name: str) -> None:
+    with pytest.raises(UnknownTypeError, match=name):
+        message_class(name)
