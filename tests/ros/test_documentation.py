@@ -34,11 +34,11 @@ def test_readme_has_the_parameters_of_the_node(node: str) -> None:
 
 def test_readme_counts_the_fault_tests() -> None:
     folder = Path(__file__).parent
-    files = sorted(folder.glob('test_*_faults.py'))
+    files = sorted(folder.rglob('test_*faults.py'))
     command = [sys.executable, '-m', 'pytest', '-p', 'pytest_timeout', '--collect-only', '-q']
     listed = subprocess.run([*command, *files], capture_output=True, text=True, check=True).stdout
-    found = Counter(re.findall(r'^(tests/ros/test_\w+_faults\.py)::', listed, re.MULTILINE))
+    found = Counter(re.findall(r'^(tests/ros/[\w/]+faults\.py)::', listed, re.MULTILINE))
     text = README.read_text(encoding='utf-8')
-    stated = re.findall(r'^\| `(tests/ros/test_\w+_faults\.py)` \| (\d+) \|', text, re.MULTILINE)
+    stated = re.findall(r'^\| `(tests/ros/[\w/]+faults\.py)` \| (\d+) \|', text, re.MULTILINE)
     assert {file: int(count) for file, count in stated} == found
     assert len(found) == len(files) == 3

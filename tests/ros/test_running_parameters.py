@@ -27,7 +27,7 @@ def change(node: Node, **values) -> None:
 
 def test_no_parameter_is_left_out() -> None:
     sources = ''.join(
-        path.read_text(encoding='utf-8') for path in Path(__file__).parent.glob('test_*.py')
+        path.read_text(encoding='utf-8') for path in Path(__file__).parent.rglob('test_*.py')
     )
     for node, table in TABLES.items():
         for parameter in table:

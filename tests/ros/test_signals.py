@@ -104,7 +104,7 @@ def test_signal_that_somebody_took_for_an_error_ends_the_node(start, program: st
     assert (process.returncode, errors) == (0, '')
 
 
-@pytest.mark.parametrize('module', ['goal_node', 'recorder_node', 'sim_bridge_node', 'commander'])
+@pytest.mark.parametrize('module', ['goal.node', 'recorder.node', 'sim.node', 'commander'])
 def test_what_computes_nothing_with_weights_starts_without_pytorch(module: str) -> None:
     program = f'import sys, metagcttt.{module}; raise SystemExit("torch" in sys.modules)'
     assert subprocess.run([sys.executable, '-c', program]).returncode == 0
