@@ -4,6 +4,7 @@ SHELL := /bin/bash
 .PHONY: help setup demo test assets lint clean
 
 PYTHON := .venv/bin/python
+METAGCTTT := .venv/bin/metagcttt
 ARGS ?=
 WORKERS ?= 2
 
@@ -21,17 +22,17 @@ setup: ## create .venv with pinned packages and build the ROS workspace
 	@tools/setup.sh
 
 demo: setup ## drive the real maze over ROS: three policies, five goals, a table and a picture
-	@$(RUN) $(PYTHON) -m tools.demo $(ARGS)
+	@$(RUN) $(METAGCTTT) demo $(ARGS)
 
 test: setup ## run all tests; ARGS='-k filter' passes options to pytest
 	@$(RUN) $(PYTEST) -n $(WORKERS) $(ARGS)
 
 PRESET := --preset pointmaze-medium-navigate-cpu
 assets: setup ## train the demo's policies from scratch and pack assets/; going on where it ended
-	@$(PYTHON) -m tools.generate_data $(PRESET) --resume
-	@$(PYTHON) -m tools.pretrain $(PRESET) --resume
-	@$(PYTHON) -m tools.meta_train $(PRESET) --resume
-	@$(PYTHON) -m tools.pack_assets $(PRESET)
+	@$(METAGCTTT) generate $(PRESET) --resume
+	@$(METAGCTTT) pretrain $(PRESET) --resume
+	@$(METAGCTTT) meta-train $(PRESET) --resume
+	@$(METAGCTTT) pack-assets $(PRESET)
 
 lint: setup ## check style, formatting and types
 	@$(PYTHON) -m ruff check .

@@ -11,7 +11,7 @@ from metagcttt_core.agents.agent import Agent, TensorBatch
 Precision = Literal['float32', 'bfloat16', 'auto']
 LossFunction = Callable[[TensorBatch], tuple[Tensor, dict[str, Tensor]]]
 
-_BFLOAT16_MIN_UNITS = 256  # `tools.benchmark training`: at 128 units it costs
+_BFLOAT16_MIN_UNITS = 256  # `metagcttt benchmark training`: at 128 units it costs
 
 
 # torch's own tanh dominates GELU on a processor; written with exp it costs a quarter.

@@ -30,7 +30,7 @@ def make_direction_follower(
 
     Args:
         spec: The simulator whose robot it shall drive.
-        controller: Folder of a learned controller, as `tools.train_controller` writes it; by
+        controller: Folder of a learned controller, as `metagcttt controller train` writes it; by
             default the one that comes with the package, if the robot needs one.
 
     Raises:
@@ -69,7 +69,7 @@ def _learned(spec: SimulatorSpec, robot: str, folder: Path | None) -> LearnedFol
         raise ControllerError(
             f'{spec.name}: walking takes a learned direction controller ({spec.obs_dim} '
             f'observation and {spec.act_dim} action dimensions), and none comes with this '
-            f'package for {robot}: train one (python -m tools.train_controller --robot {robot}) '
+            f'package for {robot}: train one (metagcttt controller train --robot {robot}) '
             "and name its folder as the controller, or use OGBench's published datasets, which "
             'load as they are'
         )

@@ -53,12 +53,12 @@ def dotted_names(tree: ast.AST) -> Iterator[str]:
 
 @pytest.mark.parametrize('file', files_of('metagcttt_core'))
 def test_core_knows_neither_ros_nor_simulators_nor_tools(file):
-    assert not packages_of(file) & (ROS | SIMULATORS | {'tools', 'tests'})
+    assert not packages_of(file) & (ROS | SIMULATORS | {'metagcttt_tools', 'tests'})
 
 
 @pytest.mark.parametrize('file', files_of('sim_bridge'))
 def test_simulators_know_only_datasets_and_files_of_the_core(file):
-    assert not packages_of(file) & (ROS | {'tools', 'tests', 'torch'})
+    assert not packages_of(file) & (ROS | {'metagcttt_tools', 'tests', 'torch'})
     for name in imports_of(file):
         if name.split('.')[0] == 'metagcttt_core':
             assert name == 'metagcttt_core.files' or name.startswith('metagcttt_core.data')
@@ -66,7 +66,7 @@ def test_simulators_know_only_datasets_and_files_of_the_core(file):
 
 @pytest.mark.parametrize('file', files_of('ros2_ws/src'))
 def test_nodes_know_the_libraries_but_not_the_tools(file):
-    assert not packages_of(file) & {'tools', 'tests', 'mujoco', 'ogbench'}
+    assert not packages_of(file) & {'metagcttt_tools', 'tests', 'mujoco', 'ogbench'}
 
 
 @pytest.mark.parametrize('file', files_of(*LIBRARIES))

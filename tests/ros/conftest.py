@@ -11,8 +11,8 @@ os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 from domain_coordinator import domain_id
 from metagcttt.policy import deployment
 from metagcttt_core import make_agent, save_checkpoint, TrajectoryDataset
+from metagcttt_tools.graph.process import NodeProcess
 import pytest
-from tools.node_process import NodeProcess
 
 from tests.ros.graph import Graph
 from tests.ros.maze_walks import maze_walks

@@ -6,8 +6,8 @@ from metagcttt import commander as commander_module
 from metagcttt.commander import GoalLostError, NoAnswerError, RobotCommander
 from metagcttt_interfaces.action import ReachGoal
 from metagcttt_interfaces.msg import GoalQuery
+from metagcttt_tools.graph.process import NodeProcess
 import pytest
-from tools.node_process import NodeProcess
 
 from tests.ros.goal_rig import FREE, GoalRig
 from tests.ros.graph import Graph

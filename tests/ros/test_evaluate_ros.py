@@ -4,8 +4,8 @@ import json
 from pathlib import Path
 
 from metagcttt_core import make_agent, save_checkpoint
+from metagcttt_tools import evaluate, evaluate_ros
 import pytest
-from tools import evaluate, evaluate_ros
 
 pytestmark = pytest.mark.mujoco
 

@@ -13,10 +13,10 @@ from metagcttt_core import (
 )
 from metagcttt_core.evaluation.rollout import Episode, run_episode
 from metagcttt_interfaces.msg import EpisodeEvent, MazeState
+from metagcttt_tools.graph.process import NodeProcess
 import numpy as np
 import pytest
 from sim_bridge import make_simulator
-from tools.node_process import NodeProcess
 import torch
 
 from tests.ros.graph import EVERY, Graph, Record

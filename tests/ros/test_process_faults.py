@@ -8,17 +8,17 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from metagcttt.commander import GoalLostError, NoAnswerError, RobotCommander
 from metagcttt_interfaces.action import ReachGoal
 from metagcttt_interfaces.msg import MazeState
+from metagcttt_tools.benchmarks.restarts import drive
+from metagcttt_tools.graph.process import NodeProcess
 import numpy as np
 import pytest
-from tools.benchmarks.restarts import drive
-from tools.node_process import NodeProcess
 
 from tests.ros.graph import ANY, goal_pose, Graph, Record, RELIABLE
 
 pytestmark = [pytest.mark.slow, pytest.mark.mujoco]
 
 GOAL = (20.0, 20.0)
-# Generous, for machines with more work than cores; `tools.benchmark restarts` measures the times.
+# Generous, for machines with more work than cores; `metagcttt benchmark restarts` measures.
 PATIENCE_S = 60.0
 
 

@@ -9,8 +9,8 @@ import time
 from ament_index_python import get_package_prefix
 from metagcttt_core.config.assets import assets_dir
 from metagcttt_interfaces.msg import EpisodeEvent
+from metagcttt_tools.graph.process import NodeProcess
 import pytest
-from tools.node_process import NodeProcess
 
 from tests.ros.graph import ANY, goal_pose, Graph, Record
 
@@ -102,7 +102,7 @@ def catches(status: Path, number: int) -> bool:
 def test_nodes_end_with_the_program_that_started_them(graph: Graph, tmp_path: Path) -> None:
     program = f"""
 import pathlib, time
-from tools.node_process import NodeProcess
+from metagcttt_tools.graph.process import NodeProcess
 NodeProcess('recorder_node', {{'output': '{tmp_path}/all.mcap'}}, pathlib.Path('{tmp_path}/log'))
 time.sleep(600)
 """

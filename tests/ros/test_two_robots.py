@@ -5,12 +5,12 @@ from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 
-from metagcttt_core.data.recordings import read_recordings
 from metagcttt_interfaces.msg import ActionCommand, AdaptationReport, MazeState
 from metagcttt_interfaces.srv import SetTask
+from metagcttt_tools.graph.process import NodeProcess
+from metagcttt_tools.recordings.trajectories import read_recordings
 import numpy as np
 import pytest
-from tools.node_process import NodeProcess
 
 from tests.ros.graph import EVERY, Graph, RELIABLE
 from tests.ros.test_lockstep_episode import assert_same, offline_episode, TTT

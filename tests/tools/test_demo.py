@@ -7,10 +7,11 @@ import shutil
 import signal
 
 from metagcttt_core.config import assets_dir
+from metagcttt_tools import demo
+from metagcttt_tools.graph import drive
+from metagcttt_tools.graph.client import MazeClient
+from metagcttt_tools.graph.process import NodeFailedError, NodeProcess
 import pytest
-from tools import demo, graph_drive
-from tools.maze_client import MazeClient
-from tools.node_process import NodeFailedError, NodeProcess
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.mujoco]
 
@@ -67,7 +68,7 @@ def test_a_node_that_cannot_configure_shows_its_reason(tmp_path, capsys, monkeyp
     shutil.copytree(assets_dir(), assets)
     (assets / 'pointmaze-medium-navigate' / 'base' / 'checkpoint.json').write_text('{}')
     monkeypatch.setenv('METAGCTTT_ASSETS', str(assets))
-    monkeypatch.setattr(graph_drive, 'START_TIMEOUT_S', 15.0)
+    monkeypatch.setattr(drive, 'START_TIMEOUT_S', 15.0)
     with pytest.raises(SystemExit, match='2'):
         demo.main(['--out', str(tmp_path / 'out')])
     assert 'not a checkpoint of this project' in capsys.readouterr().err

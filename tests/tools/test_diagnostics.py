@@ -2,11 +2,11 @@
 
 import json
 
+from metagcttt_tools import diagnostics
+from metagcttt_tools.common.run_log import read_metrics, RunLog
 import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tools import diagnostics
-from tools.run_log import read_metrics, RunLog
 
 OLD = {  # what the logs held before samples and curves
     'inner/best_step': 4.0,
@@ -106,7 +106,7 @@ def test_many_records_become_a_hundred_points():
 @pytest.mark.parametrize(
     ('content', 'message'),
     [
-        (None, 'no run of tools.meta_train there (metrics.jsonl is missing)'),
+        (None, 'no run of metagcttt meta-train there (metrics.jsonl is missing)'),
         (json.dumps({'step': 1, 'train/loss': 2.0}) + '\n', 'holds no record of meta-post-train'),
     ],
 )

@@ -6,10 +6,10 @@ from pathlib import Path
 from metagcttt_core import load_checkpoint, TrajectoryDataset, TrajectoryFilter, TTTConfig
 from metagcttt_core.config import assets_dir
 from metagcttt_core.evaluation import run_episode
+from metagcttt_tools import draw_episodes
 import numpy as np
 import pytest
 from sim_bridge import make_simulator
-from tools import draw_episodes
 
 pytestmark = pytest.mark.mujoco
 ASSETS = assets_dir() / 'pointmaze-medium-navigate'

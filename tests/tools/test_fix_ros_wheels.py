@@ -1,7 +1,7 @@
 from pathlib import Path
 
+from fix_ros_wheels import fix_prefix, fix_text
 import pytest
-from tools.fix_ros_wheels import fix_prefix, fix_text
 
 NUMPY = '/venv/numpy/_core/include'
 PYTHON = '/usr/include/python3.11'

@@ -3,11 +3,16 @@
 import json
 
 from metagcttt_core import adapt, FilterConfig, save_checkpoint, TrajectoryFilter, TTTConfig
+from metagcttt_tools import loss_curves
+from metagcttt_tools.loss_curves import (
+    adaptation_losses,
+    loss_picture,
+    pretraining_curves,
+    roughness,
+)
 import numpy as np
 import pytest
 from tests.core.builders import assert_bit_equal, random_dataset, tiny_agent, weights_of
-from tools import loss_curves
-from tools.loss_curves import adaptation_losses, loss_picture, pretraining_curves, roughness
 
 
 @pytest.fixture

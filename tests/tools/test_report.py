@@ -2,9 +2,9 @@
 
 import json
 
+from metagcttt_tools import report
+from metagcttt_tools.report import format_report, read_study
 import pytest
-from tools import report
-from tools.report import format_report, read_study
 
 RATES = {
     'base-0': [0.2, 0.6, 0.8],
@@ -78,7 +78,7 @@ def test_tables_show_every_arm(study):
     assert '| 0.550, 0.750 | 1x |' in text
     assert '| fomaml-k1 | 1 | 0.00 ± 0.00 | 0.80 ± 0.00 | 0.80 ± 0.00 |' in text
     assert '| reptile | 50% | 0.40 ± 0.07 | 0.80 ± 0.07 |' in text
-    assert 'python -m tools.sweep --preset some-preset' in text
+    assert 'metagcttt sweep --preset some-preset' in text
 
 
 def test_the_tool_writes_tables_and_figures(study, tmp_path, capsys):
@@ -96,4 +96,4 @@ def test_unfinished_study_names_what_is_missing(study, capsys):
         report.main([str(study)])
     error = capsys.readouterr().err
     assert 'evaluation-ttt.json does not exist' in error
-    assert 'tools.sweep' in error
+    assert 'metagcttt sweep' in error

@@ -3,11 +3,11 @@
 import json
 
 from metagcttt_core import save_checkpoint
+from metagcttt_tools import success_curve
+from metagcttt_tools.success_curve import common_steps, curve_picture, curve_rows, snapshot
 import numpy as np
 import pytest
 from tests.core.builders import random_dataset, tiny_agent
-from tools import success_curve
-from tools.success_curve import common_steps, curve_picture, curve_rows, snapshot
 
 
 def make_run(folder, steps):

@@ -8,11 +8,11 @@ import subprocess
 import sys
 import time
 
-from metagcttt_core.config import load_preset, preset_names
+from metagcttt_tools import sweep
+from metagcttt_tools.common.presets import load_preset, preset_names
+from metagcttt_tools.sweep import is_evaluated, Study, SweepSettings
 import pytest
 from tests.core.builders import maze_walks
-from tools import sweep
-from tools.sweep import is_evaluated, Study, SweepSettings
 import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -124,7 +124,7 @@ def test_interrupted_study_goes_on_and_evaluates_every_policy(preset, tmp_path):
     del values['sweep']['arms']['one-step']
     preset.write_text(yaml.safe_dump(values))
     study = tmp_path / 'study'
-    command = [sys.executable, '-m', 'tools.sweep', '--preset', str(preset)]
+    command = [sys.executable, '-m', 'metagcttt_tools', 'sweep', '--preset', str(preset)]
     process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 120
     while not (study / 'base-0' / 'checkpoint').exists():

@@ -5,11 +5,11 @@ from pathlib import Path
 from mcap_ros2.writer import Writer
 from metagcttt_core import TrajectoryDataset
 from metagcttt_core.data import DatasetError
+from metagcttt_tools import top_view
+from metagcttt_tools.recordings.goal_views import read_goal_views
 import numpy as np
 from PIL import Image
 import pytest
-from tools import top_view
-from tools.goal_views import read_goal_views
 
 POINT = f'{"=" * 80}\nMSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z\n'
 TEXTS = {

@@ -9,10 +9,10 @@ import sys
 import time
 
 from metagcttt_core import load_checkpoint
+from metagcttt_tools import evaluate, meta_train, pretrain
 import numpy as np
 import pytest
 from tests.core.builders import maze_walks
-from tools import evaluate, meta_train, pretrain
 import torch
 
 SMALL_AGENT = ['--hidden', '16', '16', '--training.batch-size', '32']
@@ -107,7 +107,7 @@ def test_interrupted_run_resumes_to_the_same_bits(number, dataset_path, base, tm
     meta_train.main(meta_arguments(dataset_path, base, straight, steps))
     arguments = [*meta_arguments(dataset_path, base, broken, steps), '--checkpoint-every', '3']
     process = subprocess.Popen(
-        [sys.executable, '-m', 'tools.meta_train', *arguments],
+        [sys.executable, '-m', 'metagcttt_tools', 'meta-train', *arguments],
         cwd=ROOT,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

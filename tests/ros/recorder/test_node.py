@@ -12,15 +12,15 @@ from metagcttt.recorder.recording import (
 )
 from metagcttt.sim.node import SimBridgeNode
 from metagcttt_core import TrajectoryDataset
-from metagcttt_core.data.mcap import read_messages
-from metagcttt_core.data.recordings import STATE
+from metagcttt_tools import import_recordings as recording_to_dataset
+from metagcttt_tools.graph.process import NodeProcess
+from metagcttt_tools.recordings.mcap import read_messages
+from metagcttt_tools.recordings.trajectories import STATE
 import numpy as np
 import pytest
 from std_msgs.msg import Float64, String
 from tests.ros.graph import ANY, EVERY, Graph, Record
 from tests.ros.test_lockstep_episode import drive, offline_episode, TTT
-from tools import recording_to_dataset
-from tools.node_process import NodeProcess
 
 
 def contents(path: Path) -> dict[str, list]:

@@ -36,7 +36,7 @@ def test_robot_without_a_controller_is_refused_with_what_to_do() -> None:
     with pytest.raises(
         ControllerError,
         match=r'humanoidmaze-medium-v0: .*learned direction controller .69 observation and 21 '
-        'action.*train_controller --robot humanoid.*published datasets',
+        'action.*controller train --robot humanoid.*published datasets',
     ):
         make_direction_follower(spec)
 

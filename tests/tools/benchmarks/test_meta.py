@@ -4,8 +4,8 @@ import json
 
 from metagcttt_core import MetaConfig
 from metagcttt_core.config import assets_dir
+from metagcttt_tools.benchmarks.meta import MetaBenchmark
 import pytest
-from tools.benchmarks.meta import MetaBenchmark
 import torch
 
 

@@ -1,11 +1,11 @@
 """The baseline that the retrieval benchmark compares with selects the same rows."""
 
 from metagcttt_core import TrajectoryDataset, TrajectoryFilter
+from metagcttt_tools.benchmarks.retrieval import enlarged, in_batches
+from metagcttt_tools.benchmarks.scan import scan
+from metagcttt_tools.common.results import markdown_table
 import numpy as np
 import pytest
-from tools.benchmarks.report import markdown_table
-from tools.benchmarks.retrieval import enlarged, in_batches
-from tools.benchmarks.scan import scan
 
 
 @pytest.fixture(scope='module')

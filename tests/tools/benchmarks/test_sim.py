@@ -3,11 +3,11 @@
 import json
 from pathlib import Path
 
+from metagcttt_tools.benchmarks.sim import physics_step
+from metagcttt_tools.main import main
 import numpy as np
 import pytest
 from sim_bridge import make_simulator
-from tools import benchmark
-from tools.benchmarks.sim import physics_step
 
 pytestmark = pytest.mark.mujoco
 
@@ -30,7 +30,7 @@ def test_report_compares_the_three_by_maze(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ['--out', str(tmp_path), '--steps', '20', '--rounds', '2']
-    benchmark.main(['sim', *arguments, '--environments', 'pointmaze-medium-v0'])
+    main(['benchmark', 'sim', *arguments, '--environments', 'pointmaze-medium-v0'])
     (row,) = json.loads((tmp_path / 'sim.json').read_text())['results']['steps_per_second']
     assert row['maze'] == 'pointmaze-medium-v0'
     assert row['simulator / environment (time)'] == pytest.approx(

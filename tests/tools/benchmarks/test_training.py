@@ -3,9 +3,7 @@
 import json
 
 from metagcttt_core import make_agent
-import pytest
-from tests.core.builders import assert_changed, weights_of
-from tools.benchmarks.training import (
+from metagcttt_tools.benchmarks.training import (
     LEARNERS,
     median_ms,
     products_of,
@@ -13,6 +11,8 @@ from tools.benchmarks.training import (
     TrainingBenchmark,
     update_of,
 )
+import pytest
+from tests.core.builders import assert_changed, weights_of
 
 
 def shapes_of(name, batch_size, **settings):

@@ -1,0 +1,96 @@
+"""Command lines from typed settings: defaults, then a preset, then flags."""
+
+from collections.abc import Sequence
+import re
+import sys
+from typing import Annotated, Any, NoReturn, TypeVar
+
+from metagcttt_core.config import error_lines, Settings
+from pydantic import BaseModel, ValidationError
+import tyro
+
+from metagcttt_tools.common.presets import load_preset, presets_with
+
+SettingsT = TypeVar('SettingsT', bound=Settings)
+
+
+class _Preset(BaseModel):
+    preset: Annotated[str | None, tyro.conf.arg(help='')] = None
+
+
+def parse(
+    model: type[SettingsT],
+    description: str,
+    program: str,
+    argv: Sequence[str] | None = None,
+    *,
+    section: str | None = None,
+) -> SettingsT:
+    """The settings of one program, read from the command line.
+
+    `--preset NAME_OR_PATH` loads the values under `section` of a preset first; flags override
+    them.
+
+    Args:
+        model: The program's settings.
+        description: What the program does, with an example; opens the help page.
+        program: Its subcommand, such as `meta-train` or `benchmark sim`.
+        argv: Arguments; those of the process by default.
+        section: Key of the program's values in a preset file; by default the subcommand with
+            underscores.
+
+    Returns:
+        The validated settings. A wrong value ends the process with status 2 and a line that names
+        it.
+    """
+    section = section or re.sub(r'\W', '_', program)
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    preset, rest = tyro.cli(_Preset, args=arguments, return_unknown_args=True, add_help=False)
+    try:
+        values = preset_values(preset.preset, section)
+        description += _preset_help(section)
+        default = model.model_validate(values)
+        return tyro.cli(
+            model,
+            args=rest,
+            default=default,
+            description=description,
+            prog=f'metagcttt {program}',
+        )
+    except ValidationError as error:
+        fail(*error_lines(error))
+    except ValueError as error:
+        fail(str(error))
+
+
+def _preset_help(section: str) -> str:
+    """Name the presets that a program can start from; nothing for a program without any."""
+    names = presets_with(section)
+    if not names:
+        return ''
+    listed = [name for name in names if not name.startswith('paper-')]
+    if len(listed) < len(names):
+        listed.append("one of the paper's (metagcttt presets)")
+    return f'\n\n--preset NAME_OR_PATH starts from a preset: {", ".join(listed)}.'
+
+
+def preset_values(name: str | None, section: str) -> dict[str, Any]:
+    """What a preset says about one tool; nothing without a preset."""
+    if name is None:
+        return {}
+    values = load_preset(name)
+    if section not in values:
+        raise ValueError(f'preset {name} has no section {section!r}; it has: {", ".join(values)}')
+    if not isinstance(values[section], dict):
+        raise ValueError(
+            f'preset {name}: {section} must hold a mapping of settings, '
+            f'got {type(values[section]).__name__}'
+        )
+    return values[section]
+
+
+def fail(*lines: str) -> NoReturn:
+    """End the process with status 2 after printing each line to standard error."""
+    for line in lines:
+        print(f'error: {line}', file=sys.stderr)
+    raise SystemExit(2)

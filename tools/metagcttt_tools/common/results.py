@@ -1,0 +1,44 @@
+"""How benchmark results are shown and kept."""
+
+from abc import ABC, abstractmethod
+import os
+from pathlib import Path
+import platform
+from typing import Any
+
+from metagcttt_core.config import Settings
+from metagcttt_core.files import write_json
+
+from metagcttt_tools.common.session import provenance
+
+
+class Benchmark(Settings, ABC):
+    """Settings of a benchmark."""
+
+    @abstractmethod
+    def run(self) -> None:
+        """Measure, print a table and write JSON."""
+
+
+def markdown_table(rows: list[dict[str, Any]]) -> str:
+    """Rows of equal keys as a Markdown table; numbers with three significant digits."""
+
+    def cell(value: Any) -> str:
+        if isinstance(value, float):
+            return f'{value:.3g}' if abs(value) < 1000 else f'{value:,.0f}'
+        return f'{value:,}' if isinstance(value, int) else str(value)
+
+    lines = ['| ' + ' | '.join(rows[0]) + ' |', '|---' * len(rows[0]) + '|']
+    lines += ['| ' + ' | '.join(cell(value) for value in row.values()) + ' |' for row in rows]
+    return '\n'.join(lines)
+
+
+def write_report(path: Path, settings: Settings, results: dict[str, Any]) -> None:
+    """Results as JSON, with settings, commit, versions and machine."""
+    report = {
+        'settings': settings.model_dump(mode='json'),
+        **provenance(),
+        'machine': {'processor': platform.machine(), 'cores': os.cpu_count()},
+        'results': results,
+    }
+    write_json(path, report)

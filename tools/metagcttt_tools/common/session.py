@@ -1,0 +1,192 @@
+"""What the long-running tools share: logs, provenance, interruption."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import threading
+from typing import Any
+
+from metagcttt_core.config import Settings
+from metagcttt_core.files import write_json
+from metagcttt_core.meta.parallel import any_process, first_process
+from metagcttt_core.training.checkpoint import has_checkpoint, load_training_state
+from metagcttt_core.training.run import TrainingInterrupted, TrainingRun
+from pydantic import Field, field_validator
+import torch
+from torch import distributed
+from tqdm import tqdm
+
+from metagcttt_tools.common.cli import fail
+from metagcttt_tools.common.run_log import RunLog, SilentLog
+
+_PACKAGES = ('torch', 'numpy', 'mujoco', 'ogbench')
+
+
+class RunSettings(Settings):
+    """Settings that the training tools share."""
+
+    dataset: Path = Field(
+        Path('data/pointmaze-medium-navigate-v0.npz'), description='offline dataset (npz)'
+    )
+    out: Path = Field(Path('out/run'), description='folder of the run')
+    seed: int = Field(0, ge=0, description='of everything random')
+    checkpoint_every: int = Field(1000, ge=1, description='steps between checkpoints')
+    log_every: int = Field(100, ge=1, description='steps between log lines')
+    threads: int = Field(1, ge=1, description='threads for tensor operations')
+    device: str = Field('cpu', description='where to compute: cpu, cuda or cuda:NUMBER')
+    resume: bool = Field(False, description='go on from the checkpoint in OUT, if there is one')
+
+    @field_validator('device')
+    @classmethod
+    def _must_be_here(cls, device: str) -> str:
+        kind, _, number = device.partition(':')
+        count = {'cpu': 1, 'cuda': torch.cuda.device_count()}.get(kind, 0)
+        if not (number or '0').isdigit() or int(number or '0') >= count:
+            raise ValueError(
+                f'must be cpu, cuda or cuda:NUMBER; this machine has {torch.cuda.device_count()} '
+                'CUDA devices'
+            )
+        return device
+
+    @property
+    def checkpoint_folder(self) -> Path:
+        """Where the run's checkpoint is."""
+        return self.out / 'checkpoint'
+
+
+@dataclass(frozen=True)
+class Session:
+    """A run in progress: its checkpoints, logs and progress bar."""
+
+    run: TrainingRun
+    log: RunLog
+    bar: tqdm
+
+    def warn(self, step: int, warnings: Sequence[str]) -> None:
+        """Say what looks bad, above the progress bar."""
+        for warning in warnings:
+            self.bar.write(f'warning: after step {step}: {warning}', file=sys.stderr)
+
+
+@contextmanager
+def training_session(
+    settings: RunSettings, stage: str, decisive: dict[str, Any], steps: int
+) -> Iterator[Session]:
+    """Logs, checkpoints and a clean end for a training tool.
+
+    Of the processes that `torchrun` starts, the first one writes.
+
+    Args:
+        settings: The tool's settings.
+        stage: `pretrain` or `post_train`.
+        decisive: Everything that decides the result; see `TrainingRun`.
+        steps: Number of steps of the whole run.
+
+    Raises:
+        SystemExit: With status 130 after Ctrl-C or SIGTERM, everything done so far being saved;
+            with status 2 when something cannot be written, the last checkpoint being left whole.
+    """
+    folder = settings.checkpoint_folder
+    exists = has_checkpoint(folder)
+    if exists and not settings.resume:
+        fail(f'{folder} holds a checkpoint: go on with --resume, or choose another --out')
+    first = load_training_state(folder).step if exists else 0
+    writes = first_process()
+    try:
+        if writes:
+            write_settings(settings.out, settings)
+        with (
+            stop_on_signal() as stop,
+            RunLog(settings.out, first) if writes else SilentLog() as log,
+            tqdm(total=steps, initial=first, unit='step', desc=stage, disable=not writes) as bar,
+        ):
+            run = TrainingRun(
+                stage,
+                decisive,
+                folder,
+                every=settings.checkpoint_every,
+                resume=settings.resume,
+                should_stop=lambda: any_process(stop.is_set(), torch.device(settings.device)),
+                writes=writes,
+            )
+            yield Session(run, log, bar)
+    except TrainingInterrupted as interruption:
+        if writes:
+            print(f'{interruption}; go on with --resume')
+        raise SystemExit(130) from interruption
+    except OSError as error:
+        fail(f'{settings.out}: cannot be written ({error}); {left_behind(settings)}')
+    if writes:
+        print(f'policy: {folder}')
+
+
+def left_behind(settings: RunSettings) -> str:
+    """What there is to go on from after a failure, in words."""
+    if not has_checkpoint(settings.checkpoint_folder):
+        return 'there is no checkpoint yet'
+    step = load_training_state(settings.checkpoint_folder).step
+    return f'the checkpoint of step {step} is whole'
+
+
+@contextmanager
+def process_group(device: str) -> Iterator[None]:
+    """Connects the processes that `torchrun` started; without it there is nothing to connect."""
+    if not distributed.is_torchelastic_launched():
+        yield
+        return
+    if device == 'cuda':
+        torch.cuda.set_device(int(os.environ['LOCAL_RANK']))
+    distributed.init_process_group('gloo' if device == 'cpu' else 'nccl')
+    try:
+        yield
+    finally:
+        distributed.destroy_process_group()
+
+
+@contextmanager
+def stop_on_signal() -> Iterator[threading.Event]:
+    """An event that Ctrl-C or SIGTERM sets, so that a run can save before it ends."""
+    stop = threading.Event()
+
+    def request(signum: int, frame: object) -> None:
+        stop.set()
+
+    signals = (signal.SIGINT, signal.SIGTERM)
+    previous = {number: signal.signal(number, request) for number in signals}
+    try:
+        yield stop
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def provenance() -> dict[str, Any]:
+    """Commit and package versions that a result comes from."""
+    try:
+        commit = subprocess.run(
+            ['git', 'describe', '--always', '--dirty', '--exclude=*'],
+            capture_output=True,
+            text=True,
+            check=True,
+            cwd=Path(__file__).parent,
+        ).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        commit = 'unknown'  # not a checkout, or no git
+    return {'commit': commit, 'versions': {name: version(name) for name in _PACKAGES}}
+
+
+def write_settings(folder: Path, settings: Settings) -> None:
+    """The resolved settings, beside a run's results."""
+    record = {'settings': settings.model_dump(mode='json'), **provenance()}
+    write_json(folder / 'settings.json', record)
+
+
+def use_threads(count: int) -> None:
+    """Threads for tensor operations; results are repeatable for an equal count."""
+    torch.set_num_threads(count)

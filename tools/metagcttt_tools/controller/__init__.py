@@ -1,0 +1,1 @@
+"""Training of the controllers that walk a robot along a direction."""

@@ -1,0 +1,282 @@
+"""Train the controller that walks a robot along a direction, which offline data needs."""
+
+from collections.abc import Callable
+import json
+from pathlib import Path
+from typing import Any
+
+from metagcttt_core.config import Settings
+from metagcttt_core.files import atomic_write
+import numpy as np
+from pydantic import Field
+from safetensors import safe_open
+import safetensors.torch
+from sim_bridge.controllers import LearnedFollower
+from sim_bridge.controllers.training_ground import Robot, TrainingGround
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.run_log import RunLog
+from metagcttt_tools.common.session import provenance, stop_on_signal, use_threads, write_settings
+from metagcttt_tools.controller.sac import SAC, SACConfig
+
+_DESCRIPTION = """Train the controller that walks a robot along a direction (SAC).
+
+Example: metagcttt controller train --out out/ant-controller
+Writes OUT/controller, OUT/checkpoint.safetensors (replay buffer included) and logs.
+Ctrl-C saves and ends; --resume goes on, with a new episode."""
+
+
+class TrainControllerSettings(Settings):
+    """Settings of the tool."""
+
+    robot: Robot = Field('ant', description='what learns to walk')
+    out: Path = Field(Path('out/ant-controller'), description='folder of the run')
+    steps: int = Field(200_000, ge=1, description='environment steps')
+    decay_steps: int = Field(
+        25_000, ge=0, description='last steps, over which the learning rate falls linearly to zero'
+    )
+    update_every: int = Field(2, ge=1, description='environment steps per update')
+    replay_size: int = Field(1_000_000, ge=1, description='latest transitions to learn from')
+    random_steps: int = Field(5000, ge=1, description='uniformly random actions at the start')
+    sac: SACConfig = SACConfig()
+    seed: int = Field(0, ge=0, description='of everything random')
+    checkpoint_every: int = Field(20_000, ge=1, description='steps between checkpoints')
+    log_every: int = Field(2000, ge=1, description='steps between log lines')
+    threads: int = Field(1, ge=1, description='threads for tensor operations')
+    resume: bool = Field(False, description='go on from the checkpoint in OUT, if there is one')
+
+    @property
+    def checkpoint(self) -> Path:
+        """Everything that a resumed run needs."""
+        return self.out / 'checkpoint.safetensors'
+
+
+class ReplayBuffer:
+    """The latest transitions of a run; a new one takes the place of the oldest when it is full.
+
+    Attributes:
+        arrays: The transitions by name, one row each; rows from `size` on are not in use.
+        added: Number of transitions so far, those that are gone included.
+    """
+
+    def __init__(self, capacity: int, obs_dim: int, act_dim: int) -> None:
+        """Reserve the memory."""
+        shapes: dict[str, tuple[int, ...]] = {
+            'observations': (obs_dim,),
+            'actions': (act_dim,),
+            'next_observations': (obs_dim,),
+            'rewards': (),
+            'masks': (),
+        }
+        self.arrays = {
+            name: np.empty((capacity, *shape), np.float32) for name, shape in shapes.items()
+        }
+        self.capacity = capacity
+        self.added = 0
+
+    @property
+    def size(self) -> int:
+        """Number of transitions there are."""
+        return min(self.added, self.capacity)
+
+    def add(self, **transition: Any) -> None:
+        """Append one transition."""
+        for name, array in self.arrays.items():
+            array[self.added % self.capacity] = transition[name]
+        self.added += 1
+
+    def sample(self, count: int, rng: np.random.Generator) -> dict[str, Tensor]:
+        """Draw transitions uniformly, with replacement."""
+        idxs = rng.integers(self.size, size=count)
+        return {
+            name: torch.from_numpy(array.take(idxs, axis=0)) for name, array in self.arrays.items()
+        }
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The transitions so far, by name; they share the memory."""
+        rows = {
+            f'replay.{name}': torch.from_numpy(array[: self.size])
+            for name, array in self.arrays.items()
+        }
+        return {**rows, 'replay.added': torch.tensor(self.added)}
+
+    def load_tensors(self, tensors: dict[str, Tensor]) -> None:
+        """Take over what `tensors` gave."""
+        for name, array in self.arrays.items():
+            rows = tensors[f'replay.{name}']
+            array[: len(rows)] = rows
+        self.added = int(tensors['replay.added'])
+
+
+class ControllerTraining:
+    """One run: its robot, learner and replay buffer."""
+
+    def __init__(self, settings: TrainControllerSettings) -> None:
+        """Build everything, fresh."""
+        self.settings = settings
+        self.ground = TrainingGround(settings.robot)
+        dims = self.ground.obs_dim, self.ground.act_dim
+        self.learner = SAC(*dims, settings.sac, settings.seed)
+        self.replay = ReplayBuffer(settings.replay_size, *dims)
+
+    def run(
+        self,
+        log: Callable[[int, dict[str, float]], None],
+        should_stop: Callable[[], bool] = lambda: False,
+    ) -> bool:
+        """Train to the last step; returns whether it got there.
+
+        Args:
+            log: Told the number of steps done and scalars, every `log_every` steps.
+            should_stop: Asked after every step; true saves and ends the run.
+        """
+        settings, replay = self.settings, self.replay
+        meters = _Meters()
+        observation = None
+        for step in range(replay.added, settings.steps):
+            rng = np.random.default_rng((settings.seed, step))
+            if observation is None:
+                observation = self.ground.reset(seed=int(rng.integers(2**32)))
+            action = self._action(observation, step, rng)
+            result = self.ground.step(action)
+            replay.add(
+                observations=observation,
+                actions=action,
+                next_observations=result.observation,
+                rewards=result.reward,
+                masks=not result.fallen,
+            )
+            meters.add(result.reward, result.fallen)
+            observation = None if result.over else result.observation
+            done = step + 1
+            if done > settings.random_steps and done % settings.update_every == 0:
+                batch = replay.sample(settings.sac.batch_size, rng)
+                self.learner.set_lr(settings.sac.lr * self._lr_share(step))
+                meters.losses = self.learner.update(batch, rng)
+            if done % settings.log_every == 0:
+                log(done, meters.read())
+            stopping = should_stop()
+            if stopping or done % settings.checkpoint_every == 0 or done == settings.steps:
+                self.save()
+            if stopping and done < settings.steps:
+                return False
+        return True
+
+    def follower(self) -> LearnedFollower:
+        """The deterministic controller learned so far: the mean of the actor."""
+        actor = self.learner.actor
+        weights = [weight.detach()[0].numpy().copy() for weight in actor.weights]
+        biases = [bias.detach()[0, 0].numpy().copy() for bias in actor.biases]
+        act_dim = self.ground.act_dim
+        weights[-1] = weights[-1][:, :act_dim].copy()  # the rest is the standard deviation
+        biases[-1] = biases[-1][:act_dim].copy()
+        metadata = {
+            'steps': self.replay.added,
+            'decay_steps': self.settings.decay_steps,
+            'training': _decisive(self.settings),
+            **provenance(),
+        }
+        return LearnedFollower(self.settings.robot, tuple(weights), tuple(biases), metadata)
+
+    def save(self) -> None:
+        """Write the controller, then the checkpoint, each whole or not at all."""
+        self.follower().save(self.settings.out / 'controller')
+        tensors = {**self.learner.tensors(), **self.replay.tensors()}
+        metadata = {'settings': json.dumps(_decisive(self.settings))}
+        with atomic_write(self.settings.checkpoint) as file:
+            file.write(safetensors.torch.save(tensors, metadata))
+
+    def restore(self) -> None:
+        """Go on from the checkpoint in OUT.
+
+        Raises:
+            ValueError: If it is of a run with other settings; names the first that differs.
+        """
+        path = self.settings.checkpoint
+        with safe_open(path, framework='pt') as file:
+            stored = json.loads(file.metadata()['settings'])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
+        for name, asked in _decisive(self.settings).items():
+            if stored.get(name) != asked:
+                raise ValueError(
+                    f'{path}: cannot resume, {name} was {stored.get(name)!r} and is now {asked!r}'
+                )
+        done = int(tensors['replay.added'])
+        if done > self.settings.steps:
+            raise ValueError(f'{path}: has {done} steps already, asked for {self.settings.steps}')
+        self.learner.load_tensors(tensors)
+        self.replay.load_tensors(tensors)
+
+    def _lr_share(self, step: int) -> float:
+        left = self.settings.steps - step
+        return min(1.0, left / self.settings.decay_steps) if self.settings.decay_steps else 1.0
+
+    def _action(self, observation: np.ndarray, step: int, rng: np.random.Generator) -> np.ndarray:
+        if step < self.settings.random_steps:
+            return rng.uniform(-1.0, 1.0, self.ground.act_dim)
+        return self.learner.act(observation, rng)
+
+
+class _Meters:
+    """What happened since the last log line."""
+
+    def __init__(self) -> None:
+        self._rewards: list[float] = []
+        self._falls = 0
+        self.losses: dict[str, Tensor] = {}
+
+    def add(self, reward: float, fallen: bool) -> None:
+        self._rewards.append(reward)
+        self._falls += fallen
+
+    def read(self) -> dict[str, float]:
+        """Scalars of the stretch, which ends here."""
+        scalars = {'reward_per_step': float(np.mean(self._rewards)), 'falls': float(self._falls)}
+        scalars |= {name: float(value) for name, value in self.losses.items()}
+        self._rewards, self._falls = [], 0
+        return scalars
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run the tool."""
+    settings = parse(TrainControllerSettings, _DESCRIPTION, 'controller train', argv)
+    use_threads(settings.threads)
+    try:
+        _run(settings)
+    except ValueError as error:
+        fail(str(error))
+
+
+def _run(settings: TrainControllerSettings) -> None:
+    training = ControllerTraining(settings)
+    if settings.checkpoint.exists():
+        if not settings.resume:
+            fail(f'{settings.checkpoint} exists: go on with --resume, or choose another --out')
+        training.restore()
+    write_settings(settings.out, settings)
+    first = training.replay.added
+    with (
+        stop_on_signal() as stop,
+        RunLog(settings.out, first) as run_log,
+        tqdm(total=settings.steps, initial=first, unit='step', desc=settings.robot) as bar,
+    ):
+
+        def log(step: int, scalars: dict[str, float]) -> None:
+            run_log.write(step, scalars)
+            bar.set_postfix(reward=f'{scalars["reward_per_step"]:.3f}', refresh=False)
+            bar.update(step - bar.n)
+
+        finished = training.run(log, stop.is_set)
+    if not finished:
+        print(f'stopped after step {training.replay.added}; go on with --resume')
+        raise SystemExit(130)
+    print(f'controller: {settings.out / "controller"}')
+
+
+def _decisive(settings: TrainControllerSettings) -> dict[str, Any]:
+    """The settings that decide the course; how long it goes on may change on the way."""
+    fields = {'robot', 'update_every', 'replay_size', 'random_steps', 'sac', 'seed', 'threads'}
+    return settings.model_dump(mode='json', include=fields)

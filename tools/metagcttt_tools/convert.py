@@ -1,0 +1,150 @@
+"""Turn parameters of OGBench's own JAX agents into a checkpoint to deploy and train on here."""
+
+from collections.abc import Mapping
+from pathlib import Path
+import re
+from typing import Annotated, Any
+
+from metagcttt_core import Agent, DatasetError, make_agent, save_checkpoint
+from metagcttt_core.agents import AgentName
+from metagcttt_core.agents.gciql import ActorLoss
+from metagcttt_core.config import Settings
+from metagcttt_core.data.npz import read_arrays
+from metagcttt_core.training.checkpoint import has_checkpoint
+import numpy as np
+from pydantic import Field
+import tyro
+
+from metagcttt_tools.common.cli import fail, parse
+
+_DESCRIPTION = """Turn parameters of OGBench's JAX agents (.npz) into a checkpoint.
+
+Example: metagcttt convert params.npz --agent gciql --alpha 0.003
+The arrays have OGBench's names, joined by dots, as `np.savez('params.npz',
+**flax.traverse_util.flatten_dict(agent.network.params, sep='.'))` writes them, or ours:
+actor.fc0.kernel, value.ln0.scale, critic1.out.bias, ... Widths follow from the arrays."""
+
+_OGBENCH_NETS = {
+    'modules_actor': ('actor',),
+    'modules_value': ('value',),
+    'modules_critic': ('critic1', 'critic2'),
+    'modules_target_critic': ('target1', 'target2'),
+}
+
+
+class ConvertSettings(Settings):
+    """Settings of the tool."""
+
+    file: Annotated[Path, tyro.conf.Positional] = Field(
+        Path('params.npz'), description='named arrays (npz)'
+    )
+    agent: AgentName = Field('gcbc', description='kind of agent')
+    environment: str = Field('pointmaze-medium-v0', description='simulator the policy is for')
+    discount: float = Field(0.99, gt=0, lt=1, description='that the agent was trained with')
+    actor_loss: ActorLoss | None = Field(None, description='of GCIQL, to train it further')
+    alpha: float | None = Field(None, ge=0, description='of GCIQL, to train it further')
+    prefix: str = Field('', description='convert only the arrays under this name, such as init')
+    out: Path = Field(Path('out/converted'), description='folder for the checkpoint')
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run the tool."""
+    settings = parse(ConvertSettings, _DESCRIPTION, 'convert', argv)
+    if has_checkpoint(settings.out):
+        fail(f'{settings.out} holds a checkpoint: choose another --out')
+    try:
+        arrays = under_prefix(read_arrays(settings.file, []), settings.prefix)
+        extra = settings.model_dump(include={'actor_loss', 'alpha'}, exclude_none=True)
+        agent = agent_from(arrays, settings.agent, discount=settings.discount, **extra)
+    except DatasetError as error:
+        fail(str(error))
+    except ValueError as error:
+        fail(f'{settings.file}: {error}')
+    agent.metadata = {
+        'environment': settings.environment,
+        'history': [{'stage': 'converted', 'file': settings.file.name}],
+    }
+    save_checkpoint(agent, settings.out)
+    print(
+        f'{agent.name}, {agent.obs_dim} observations, {agent.act_dim} actions, '
+        f'{" x ".join(map(str, agent.settings.hidden))} units: {settings.out}'
+    )
+
+
+def under_prefix(arrays: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    """The arrays named `prefix`.NAME, by NAME; all of them without a prefix."""
+    start = f'{prefix}.' if prefix else ''
+    return {
+        name.removeprefix(start): array for name, array in arrays.items() if name.startswith(start)
+    }
+
+
+def agent_from(arrays: Mapping[str, np.ndarray], name: AgentName, **settings: Any) -> Agent:
+    """The agent that reference arrays describe.
+
+    Args:
+        arrays: By OGBench's names (`modules_...`) or those of `Agent.import_reference_parameters`.
+        name: Kind of agent.
+        settings: Further settings of the agent; units and `const_std` follow from the arrays.
+
+    Raises:
+        ValueError: If arrays are missing, unknown or of a wrong shape; names them.
+    """
+    own = from_ogbench_names(arrays)
+    kernels = [own.get(f'actor.{layer}.kernel') for layer in (*_hidden_layers(own), 'mean')]
+    if len(kernels) < 2 or any(kernel is None or kernel.ndim != 2 for kernel in kernels):
+        raise ValueError(
+            'the actor needs kernels actor.fc0.kernel, actor.fc1.kernel, ..., actor.mean.kernel '
+            f'of two dimensions; found: {", ".join(sorted(own)) or "no arrays"}'
+        )
+    widths = [kernel.shape for kernel in kernels if kernel is not None]
+    agent = make_agent(
+        name,
+        obs_dim=widths[0][0] // 2,
+        act_dim=widths[-1][1],
+        hidden=[out for _, out in widths[:-1]],
+        const_std='actor.log_stds' not in own,
+        **settings,
+    )
+    agent.import_reference_parameters(own)
+    return agent
+
+
+def _hidden_layers(arrays: Mapping[str, np.ndarray]) -> list[str]:
+    count = sum(bool(re.fullmatch(r'actor\.fc\d+\.kernel', name)) for name in arrays)
+    return [f'fc{index}' for index in range(count)]
+
+
+def from_ogbench_names(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays by our names; those that do not begin with `modules_` keep theirs.
+
+    OGBench stacks twin critics along a first axis and numbers a network's linear layers, the last
+    of which is the head.
+    """
+    renamed = {}
+    heads = {net: _last_dense(arrays, net) for net in _OGBENCH_NETS}
+    for name, array in arrays.items():
+        net, _, rest = name.partition('.')
+        if net not in _OGBENCH_NETS:
+            renamed[name] = array
+            continue
+        rest = re.sub(r'^(actor_net|value_net)\.', '', rest).replace('mean_net.', 'mean.')
+        if net != 'modules_actor':
+            rest = rest.replace(f'Dense_{heads[net]}.', 'out.')
+        rest = re.sub(r'^Dense_(\d+)\.', r'fc\1.', rest)
+        rest = re.sub(r'^LayerNorm_(\d+)\.', r'ln\1.', rest)
+        targets = _OGBENCH_NETS[net]
+        if len(targets) == 1:
+            renamed[f'{targets[0]}.{rest}'] = array
+            continue
+        if array.ndim == 0 or len(array) != len(targets):
+            raise ValueError(
+                f'{name} must hold two critics along its first axis, got {array.shape}'
+            )
+        renamed |= {f'{target}.{rest}': part for target, part in zip(targets, array, strict=True)}
+    return renamed
+
+
+def _last_dense(arrays: Mapping[str, np.ndarray], net: str) -> int | None:
+    pattern = re.compile(rf'{net}\.value_net\.Dense_(\d+)\.kernel')
+    return max((int(m[1]) for m in map(pattern.fullmatch, arrays) if m), default=None)

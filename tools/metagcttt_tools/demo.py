@@ -1,0 +1,141 @@
+"""The main job: goals published on a topic make a robot filter, adapt and drive there."""
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from metagcttt.commander import NoAnswerError
+from metagcttt_core import TrajectoryDataset
+from metagcttt_core.config import assets_dir, Settings
+from metagcttt_core.files import write_json
+import numpy as np
+from pydantic import Field
+from sim_bridge import make_simulator
+
+from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.plots import demo_picture, save
+from metagcttt_tools.common.session import provenance
+from metagcttt_tools.graph.client import GoalOutcome, MazeClient
+from metagcttt_tools.graph.drive import drive_arms
+from metagcttt_tools.graph.process import NodeFailedError
+
+_DESCRIPTION = """Drive the point maze over ROS 2: three policies, five goals.
+
+Example: make demo, or metagcttt demo in a set-up checkout
+Starts sim_bridge_node, goal_node and policy_node as separate processes, publishes the five
+evaluation goals on `goal_pose` for each arm, prints a table and writes OUT/summary.json and
+OUT/demo.png."""
+
+_ENVIRONMENT = 'pointmaze-medium-v0'
+_ASSETS = 'pointmaze-medium-navigate'
+
+
+class DemoSettings(Settings):
+    """Settings of the tool."""
+
+    out: Path = Field(Path('out/demo'), description='folder for summary, picture and node logs')
+    steps: int = Field(10, ge=1, description='test-time training steps K of the adapting arms')
+    seed: int = Field(0, ge=0, description='of starts, goals and adaptations')
+    timeout_s: float = Field(60.0, gt=0, description='longest wait for one goal, seconds')
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run the tool."""
+    settings = parse(DemoSettings, _DESCRIPTION, 'demo', argv)
+    try:
+        outcomes = run_arms(settings)
+    except (NodeFailedError, NoAnswerError, FileNotFoundError) as error:
+        fail(str(error))
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None
+    report(settings, outcomes)
+
+
+def run_arms(settings: DemoSettings) -> dict[str, list[GoalOutcome]]:
+    """Outcome of each task's goal by arm, from three processes that talk over DDS."""
+    arms = {
+        'base policy': ('base', 0),
+        f'base + TTT (K = {settings.steps})': ('base', settings.steps),
+        f'meta + TTT (K = {settings.steps})': ('meta', settings.steps),
+    }
+    return drive_arms(
+        {
+            arm: {'checkpoint': str(assets_dir() / _ASSETS / checkpoint), 'adapt_steps': steps}
+            for arm, (checkpoint, steps) in arms.items()
+        },
+        [
+            partial(
+                MazeClient.drive,
+                task_id=task.task_id,
+                seed=settings.seed,
+                timeout_s=settings.timeout_s,
+            )
+            for task in make_simulator(_ENVIRONMENT).tasks
+        ],
+        logs=settings.out / 'logs',
+    )
+
+
+def report(settings: DemoSettings, outcomes: dict[str, list[GoalOutcome]]) -> None:
+    """Print the table; write the summary and the picture."""
+    summary = {
+        'environment': _ENVIRONMENT,
+        'settings': settings.model_dump(mode='json'),
+        **provenance(),
+        'arms': {
+            arm: [{'task': task, **numbers(outcome)} for task, outcome in enumerate(results, 1)]
+            for arm, results in outcomes.items()
+        },
+    }
+    write_json(settings.out / 'summary.json', summary)
+    dataset = TrajectoryDataset.load(assets_dir() / _ASSETS / 'dataset.npz')
+    simulator = make_simulator(_ENVIRONMENT)
+    last = list(outcomes.values())[-1]
+    figure = demo_picture(
+        simulator.maze,
+        paths={arm: [np.array(o.path) for o in results] for arm, results in outcomes.items()},
+        successes={arm: [o.success for o in results] for arm, results in outcomes.items()},
+        segments=[
+            [
+                dataset.observations[start:stop, :2]
+                for start, stop in zip(
+                    o.report.segment_starts, o.report.segment_stops, strict=True
+                )
+            ]
+            for o in last
+        ],
+        goals=[outcome.goal for outcome in last],
+    )
+    save(figure, settings.out / 'demo.png')
+    print(format_table(summary['arms']))
+    print(f'summary: {settings.out / "summary.json"}\npicture: {settings.out / "demo.png"}')
+
+
+def numbers(outcome: GoalOutcome) -> dict[str, Any]:
+    """The figures of one goal."""
+    adaptation = outcome.report
+    return {
+        'success': outcome.success,
+        'steps': outcome.steps,
+        'adaptation_ms': adaptation.filter_ms + adaptation.adapt_ms,
+        'transitions': adaptation.transitions,
+        'trajectories': adaptation.kept_trajectories,
+    }
+
+
+def format_table(arms: dict[str, list[dict[str, Any]]]) -> str:
+    """The arms side by side, as Markdown."""
+    lines = [
+        '| arm | goals reached | steps by task | adaptation ms (median) | transitions (median) |',
+        '|---|---|---|---|---|',
+    ]
+    for arm, goals in arms.items():
+        reached = sum(goal['success'] for goal in goals)
+        steps = ', '.join(str(g['steps']) if g['success'] else 'missed' for g in goals)
+        adaptation = np.median([goal['adaptation_ms'] for goal in goals])
+        transitions = np.median([goal['transitions'] for goal in goals])
+        lines.append(
+            f'| {arm} | {reached} of {len(goals)} | {steps} '
+            f'| {adaptation:.0f} | {transitions:.0f} |'
+        )
+    return '\n'.join(lines)

@@ -1,0 +1,120 @@
+"""Draw one episode per task: what was retrieved for it and where a policy went."""
+
+from pathlib import Path
+from typing import Any
+
+from metagcttt_core import (
+    FilterConfig,
+    load_checkpoint,
+    TrajectoryDataset,
+    TrajectoryFilter,
+    TTTConfig,
+)
+from metagcttt_core.config import Settings
+from metagcttt_core.evaluation import Episode, run_episode
+import numpy as np
+from pydantic import Field
+from sim_bridge import make_simulator
+from tqdm import tqdm
+
+from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.plots import demo_picture, save
+from metagcttt_tools.common.results import markdown_table, write_report
+from metagcttt_tools.common.session import use_threads
+
+_DESCRIPTION = """Draw one episode per task: what was retrieved and where a policy went.
+
+Example: metagcttt draw-episodes --checkpoint out/pretrain/checkpoint --budgets 0 50
+Runs every budget on the same starts and goals; prints a table and writes OUT.png and OUT.json."""
+
+
+class DrawSettings(Settings):
+    """Settings of the tool."""
+
+    checkpoint: Path = Field(Path('out/pretrain/checkpoint'), description='the policy')
+    dataset: Path = Field(
+        Path('data/pointmaze-medium-navigate-v0.npz'), description='dataset to adapt on'
+    )
+    budgets: tuple[int, ...] = Field(
+        (0, 50), min_length=1, max_length=6, description='numbers of gradient steps K'
+    )
+    ttt: TTTConfig = Field(TTTConfig(), description='test-time training (steps come from budgets)')
+    filter: FilterConfig = FilterConfig(variant='gcttt')
+    seed: int = Field(0, ge=0, description='of starts, goals and adaptations')
+    out: Path = Field(Path('out/episodes'), description='files to write')
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run the tool."""
+    settings = parse(DrawSettings, _DESCRIPTION, 'draw-episodes', argv)
+    use_threads(1)
+    try:
+        _run(settings)
+    except ValueError as error:
+        fail(str(error))
+
+
+def _run(settings: DrawSettings) -> None:
+    agent = load_checkpoint(settings.checkpoint)
+    dataset = TrajectoryDataset.load(settings.dataset)
+    trajectory_filter = TrajectoryFilter(dataset, settings.filter)
+    with make_simulator(str(agent.metadata['environment'])) as simulator:
+        tasks = [task.task_id for task in simulator.tasks]
+        goals = [simulator.reset(task, settings.seed)[1] for task in tasks]
+        arms: dict[str, list[Episode]] = {}
+        with tqdm(total=len(tasks) * len(settings.budgets), unit='episode') as bar:
+            for budget in settings.budgets:
+                ttt = settings.ttt.model_copy(update={'steps': budget})
+                arms[f'K = {budget}'] = episodes = []
+                for task in tasks:
+                    episodes.append(
+                        run_episode(
+                            agent,
+                            simulator,
+                            task,
+                            settings.seed,
+                            trajectory_filter=trajectory_filter,
+                            ttt=ttt,
+                        )
+                    )
+                    bar.update()
+        x, y = simulator.spec.position_dims
+        figure = demo_picture(
+            simulator.maze,
+            paths={arm: [e.observations[:, (x, y)] for e in arms[arm]] for arm in arms},
+            successes={arm: [e.success for e in arms[arm]] for arm in arms},
+            segments=[retrieved(episode, dataset, (x, y)) for episode in episodes],
+            goals=[(goal[x], goal[y]) for goal in goals],
+        )
+    rows = [summarize(arm, episode) for arm, episodes in arms.items() for episode in episodes]
+    save(figure, settings.out.with_suffix('.png'))
+    write_report(settings.out.with_suffix('.json'), settings, {'episodes': rows})
+    print(markdown_table(rows))
+    print(f'picture: {settings.out.with_suffix(".png")}')
+
+
+def retrieved(
+    episode: Episode, dataset: TrajectoryDataset, position_dims: tuple[int, int]
+) -> list[np.ndarray]:
+    """Sub-trajectories that the first adaptation of an episode trained on, each (n, 2) metres."""
+    return [
+        dataset.observations[start:stop, position_dims]
+        for support in episode.supports[:1]
+        for start, stop in support.segments
+    ]
+
+
+def summarize(arm: str, episode: Episode) -> dict[str, Any]:
+    """The figures of one episode."""
+    supports, adaptations = episode.supports, episode.adaptations
+    return {
+        'policy': arm,
+        'task': episode.task_id,
+        'reached': 'yes' if episode.success else 'no',
+        'steps': episode.steps,
+        'relevant': sum(support.num_relevant for support in supports),
+        'kept': sum(support.num_kept for support in supports),
+        'transitions': sum(support.num_transitions for support in supports),
+        'filter (ms)': sum(support.milliseconds for support in supports),
+        'adapt (ms)': 1e3 * sum(adaptation.seconds for adaptation in adaptations),
+    }

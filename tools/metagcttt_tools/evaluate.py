@@ -1,0 +1,223 @@
+"""Success of policies by test-time training budget, over tasks, episodes and seeds."""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import as_completed, ProcessPoolExecutor
+import multiprocessing
+from pathlib import Path
+import sys
+from typing import Any
+
+from metagcttt_core import (
+    CheckpointError,
+    evaluate_success,
+    FilterConfig,
+    load_checkpoint,
+    normalized_auc,
+    success_statistics,
+    TrajectoryDataset,
+    TrajectoryFilter,
+    TTTConfig,
+)
+from metagcttt_core.agents.gciql import ActorLoss
+from metagcttt_core.config import Settings
+from metagcttt_core.files import write_json
+import numpy as np
+from pydantic import Field
+from sim_bridge import make_simulator
+from tqdm import tqdm
+
+from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.job_log import JobLog
+from metagcttt_tools.common.session import provenance, use_threads
+
+_DESCRIPTION = """Success of policies by test-time training budget.
+
+Example: metagcttt evaluate --checkpoints out/pretrain/checkpoint out/meta/checkpoint
+Prints a table with standard errors over seeds and writes OUT as JSON.
+Ctrl-C is safe: --resume goes on."""
+
+
+Job = tuple[str, str, int, int, int]
+"""Checkpoint, environment, budget, seed and task."""
+
+
+class EpisodeSettings(Settings):
+    """Which episodes are driven, and how policies adapt in them."""
+
+    dataset: Path = Field(
+        Path('data/pointmaze-medium-navigate-v0.npz'), description='dataset to adapt on (npz)'
+    )
+    budgets: tuple[int, ...] = Field(
+        (0, 10, 20, 50, 100, 200), min_length=1, description='numbers of gradient steps K'
+    )
+    ttt: TTTConfig = Field(TTTConfig(), description='test-time training (steps come from budgets)')
+    filter: FilterConfig = FilterConfig()
+    episodes: int = Field(10, ge=1, description='episodes per task and seed')
+    seeds: tuple[int, ...] = Field((0, 1, 2), min_length=1, description='evaluation seeds')
+
+
+class ProtocolSettings(EpisodeSettings):
+    """How policies are evaluated."""
+
+    actor_loss: ActorLoss | None = Field(
+        None, description="to adapt GCIQL policies with; each policy's own by default"
+    )
+    processes: int = Field(2, ge=1, description='processes to spread the work over')
+    resume: bool = Field(False, description='keep what an interrupted call finished')
+
+
+class EvaluateSettings(ProtocolSettings):
+    """Settings of the tool."""
+
+    checkpoints: tuple[Path, ...] = Field(
+        (Path('out/pretrain/checkpoint'),), min_length=1, description='policies to evaluate'
+    )
+    out: Path = Field(Path('out/evaluation.json'), description='file for the results')
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run the tool."""
+    settings = parse(EvaluateSettings, _DESCRIPTION, 'evaluate', argv)
+    try:
+        results = evaluate(settings)
+    except ValueError as error:
+        fail(str(error))
+    except KeyboardInterrupt:
+        print('interrupted; the same command with --resume goes on', file=sys.stderr)
+        raise SystemExit(130) from None
+    report = {'settings': settings.model_dump(mode='json'), **provenance(), 'results': results}
+    write_json(settings.out, report)
+    print(format_table(results))
+    print(f'results: {settings.out}')
+
+
+def evaluate(settings: EvaluateSettings) -> list[dict[str, Any]]:
+    """Success by policy and budget: rates per seed, their mean and error, and the AUC."""
+    environments = [environment_of(path) for path in settings.checkpoints]
+    num_tasks = make_simulator(environments[0]).spec.num_tasks
+    jobs = [
+        (str(path), environment, budget, seed, task)
+        for path, environment in zip(settings.checkpoints, environments, strict=True)
+        for budget in settings.budgets
+        for seed in settings.seeds
+        for task in range(1, num_tasks + 1)
+    ]
+    rates = _run_jobs(settings, jobs)
+    results = []
+    for path, environment in zip(settings.checkpoints, environments, strict=True):
+        curve = []
+        for budget in settings.budgets:
+            key = (str(path), environment, budget)
+            tasks = {
+                task: [rates[*key, seed, task] for seed in settings.seeds]
+                for task in range(1, num_tasks + 1)
+            }
+            curve.append(success_point(budget, tasks))
+        results.append(success_curve(path, curve))
+    return results
+
+
+def success_point(budget: int, rates: Mapping[int, Sequence[float]]) -> dict[str, Any]:
+    """Success of one policy with one budget, given its rates by task and seed."""
+    per_seed = np.mean(list(rates.values()), axis=0)
+    statistics = success_statistics(per_seed)
+    return {
+        'budget': budget,
+        'success': statistics.mean,
+        'standard_error': statistics.standard_error,
+        'per_seed': per_seed.tolist(),
+        'per_task': {task: float(np.mean(values)) for task, values in rates.items()},
+    }
+
+
+def success_curve(checkpoint: Path, curve: list[dict[str, Any]]) -> dict[str, Any]:
+    """The points of one policy with the area under them."""
+    budgets = [point['budget'] for point in curve]
+    successes = [point['success'] for point in curve]
+    auc = normalized_auc(budgets, successes) if len(curve) > 1 else None
+    return {'checkpoint': str(checkpoint), 'curve': curve, 'auc': auc}
+
+
+def format_table(results: list[dict[str, Any]]) -> str:
+    """Success by budget as a Markdown table."""
+    budgets = [point['budget'] for point in results[0]['curve']]
+    lines = [
+        '| policy | ' + ' | '.join(f'K = {budget}' for budget in budgets) + ' | AUC |',
+        '|---' * (len(budgets) + 2) + '|',
+    ]
+    for result in results:
+        cells = [f'{p["success"]:.2f} ± {p["standard_error"]:.2f}' for p in result['curve']]
+        auc = '' if result['auc'] is None else f'{result["auc"]:.3f}'
+        lines.append(f'| {result["checkpoint"]} | ' + ' | '.join(cells) + f' | {auc} |')
+    return '\n'.join(lines)
+
+
+def _run_jobs(settings: EvaluateSettings, jobs: list[Job]) -> dict[Job, float]:
+    """Success rate of every job; jobs run in separate processes and are kept as they finish."""
+    decisive = settings.model_dump(mode='json', exclude={'processes', 'out', 'resume'})
+    path = settings.out.with_suffix('.partial.jsonl')
+    log: JobLog[Job] = JobLog(path, decisive, resume=settings.resume)
+    pool = ProcessPoolExecutor(
+        settings.processes,
+        mp_context=multiprocessing.get_context('spawn'),
+        initializer=_start_worker,
+        initargs=(settings,),
+    )
+    todo = [job for job in jobs if job not in log.finished]
+    with tqdm(total=len(jobs), initial=len(jobs) - len(todo), unit='job', desc='evaluate') as bar:
+        try:
+            futures = {pool.submit(_success_rate, job): job for job in todo}
+            for future in as_completed(futures):
+                log.add(futures[future], future.result())
+                bar.update()
+        finally:
+            pool.shutdown(cancel_futures=True)
+    log.remove()
+    return log.finished
+
+
+def environment_of(checkpoint: Path) -> str:
+    """The environment that a policy is for.
+
+    Raises:
+        CheckpointError: If it is damaged or does not say so.
+    """
+    environment = load_checkpoint(checkpoint).metadata.get('environment')
+    if environment is None:
+        raise CheckpointError(f'{checkpoint}: does not say which environment it is for')
+    return environment
+
+
+class _Worker:
+    """What a worker process loads once."""
+
+    settings: EvaluateSettings
+    trajectory_filter: TrajectoryFilter
+
+
+def _start_worker(settings: EvaluateSettings) -> None:
+    use_threads(1)
+    _Worker.settings = settings
+    _Worker.trajectory_filter = TrajectoryFilter(
+        TrajectoryDataset.load(settings.dataset), settings.filter
+    )
+
+
+def _success_rate(job: Job) -> float:
+    path, environment, budget, seed, task = job
+    simulator = make_simulator(environment)
+    result = evaluate_success(
+        load_checkpoint(
+            path,
+            environment=environment,
+            changes=_Worker.settings.model_dump(include={'actor_loss'}, exclude_none=True),
+        ),
+        simulator,
+        ttt=_Worker.settings.ttt.model_copy(update={'steps': budget}),
+        episodes=_Worker.settings.episodes,
+        tasks=[task],
+        seed=seed,
+        trajectory_filter=_Worker.trajectory_filter,
+    )
+    simulator.close()
+    return result['mean']

@@ -1,0 +1,1 @@
+"""Driving the ROS graph: its processes, its client, the episodes."""

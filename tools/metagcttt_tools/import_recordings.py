@@ -1,0 +1,65 @@
+"""Turn recordings of deployed robots into a dataset, so that deployments grow the data."""
+
+from pathlib import Path
+
+from metagcttt_core import TrajectoryDataset
+from metagcttt_core.config import Settings
+from metagcttt_core.data import DatasetError
+from pydantic import Field
+
+from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.recordings.trajectories import (
+    join_datasets,
+    read_recordings,
+    RecordingSummary,
+)
+
+_DESCRIPTION = """Turn MCAP recordings of recorder_node into a dataset (.npz).
+
+Example: metagcttt import-recordings --recordings run.mcap --out data/run.npz
+State k goes with the action that led to state k + 1; where one of them is missing, the trajectory
+is cut. What was left out is printed."""
+
+
+class RecordingSettings(Settings):
+    """Settings of the tool."""
+
+    recordings: tuple[Path, ...] = Field(
+        (), description='MCAP files; those of one split recording in order'
+    )
+    out: Path = Field(Path('data/recorded.npz'), description='dataset to write')
+    extend: Path | None = Field(
+        None, description='dataset whose trajectories are put before the recorded ones'
+    )
+    keep_idle: bool = Field(False, description='keep steps in which the robot had no goal')
+    refuse_gaps: bool = Field(False, description='fail where a trajectory would be cut')
+    overwrite: bool = Field(False, description='replace an existing dataset')
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run the tool."""
+    settings = parse(RecordingSettings, _DESCRIPTION, 'import-recordings', argv)
+    if settings.out.exists() and not settings.overwrite:
+        fail(f'{settings.out} exists: give --overwrite or another --out')
+    try:
+        dataset, summary = read_recordings(
+            settings.recordings, keep_idle=settings.keep_idle, refuse_gaps=settings.refuse_gaps
+        )
+        if settings.extend is not None:
+            dataset = join_datasets([TrajectoryDataset.load(settings.extend), dataset])
+    except DatasetError as error:
+        fail(str(error))
+    dataset.save(settings.out)
+    print(describe(summary))
+    print(f'{dataset}: {settings.out}')
+
+
+def describe(summary: RecordingSummary) -> str:
+    """What was kept and what was not, in words."""
+    lines = [
+        f'{summary.states} states and {summary.actions} actions became {summary.transitions} '
+        f'transitions in {summary.trajectories} trajectories'
+    ]
+    lines += [f'  left out: {count} {reason}' for reason, count in summary.dropped.items()]
+    lines += [f'  without its end: {path}' for path in summary.unfinished]
+    return '\n'.join(lines)

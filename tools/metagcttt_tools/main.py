@@ -1,0 +1,99 @@
+"""The command `metagcttt`: one subcommand a program, imported when it is asked for."""
+
+from collections.abc import Callable
+from importlib import import_module
+from importlib.metadata import version
+import sys
+from typing import NamedTuple
+
+import tyro
+
+_DESCRIPTION = """Goal-conditioned policies that adapt at test time, from data to robot.
+
+Each program teaches with --help and takes --preset NAME: metagcttt presets lists them.
+metagcttt --tyro-print-completion bash (or zsh, tcsh) prints a completion script."""
+
+
+class Program(NamedTuple):
+    """A subcommand: its module, which has a `main(argv)`, and its line in the help."""
+
+    module: str
+    summary: str
+
+
+class Group(NamedTuple):
+    """A subcommand with subcommands of its own."""
+
+    programs: dict[str, Program]
+    summary: str
+
+
+PROGRAMS: dict[str, Program | Group] = {
+    'generate': Program('generate', 'Generate an offline dataset of a maze.'),
+    'download': Program('download', "Download one of OGBench's published datasets."),
+    'import-recordings': Program('import_recordings', 'Turn recordings into a dataset.'),
+    'pretrain': Program('pretrain', 'Pre-train a policy on an offline dataset.'),
+    'convert': Program('convert', "Convert a policy trained with OGBench's own code."),
+    'meta-train': Program('meta_train', 'Meta-post-train a policy (Algorithm 1).'),
+    'evaluate': Program('evaluate', 'Success of policies by test-time training budget.'),
+    'evaluate-ros': Program('evaluate_ros', 'The same, driven through the ROS graph.'),
+    'sweep': Program('sweep', 'Run a whole study: training, post-training, evaluation.'),
+    'report': Program('report', 'Tables and figures of a study.'),
+    'demo': Program('demo', 'Drive the point maze over ROS 2: three policies, five goals.'),
+    'presets': Program('show_presets', "List the presets; the paper's settings as tables."),
+    'diagnostics': Program('diagnostics', 'Draw how a post-training run went.'),
+    'loss-curves': Program('loss_curves', 'Draw the losses of test-time training by part.'),
+    'success-curve': Program('success_curve', 'Draw success over pre-training.'),
+    'draw-episodes': Program('draw_episodes', 'Draw paths and retrieved data of episodes.'),
+    'top-view': Program('top_view', 'Draw a recording from above, or film it.'),
+    'benchmark': Group(
+        {
+            'meta': Program('benchmarks.meta', 'Outer steps of meta-post-training a second.'),
+            'restarts': Program('benchmarks.restarts', 'Time until a killed node serves again.'),
+            'retrieval': Program('benchmarks.retrieval', 'Milliseconds per filter query.'),
+            'ros': Program('benchmarks.ros', 'Latency and deadlines of the policy node.'),
+            'sim': Program('benchmarks.sim', 'Control steps a second by maze.'),
+            'training': Program('benchmarks.training', 'Milliseconds per gradient step.'),
+        },
+        'Measure speed against a baseline in the same run.',
+    ),
+    'controller': Group(
+        {
+            'train': Program('controller_train', 'Train a controller (SAC).'),
+            'measure': Program('controller_measure', 'Measure how well it follows directions.'),
+        },
+        'Controllers that walk a robot along a direction, which make data.',
+    ),
+    'pack-assets': Program('pack_assets', 'Pack policies and data into the assets of the demo.'),
+}
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run the command line: `metagcttt PROGRAM [ARGUMENT...]`."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments == ['--version']:
+        print(f'metagcttt {version("metagcttt-core")}')
+        return
+    prog, description, programs = 'metagcttt', _DESCRIPTION, PROGRAMS
+    while arguments and arguments[0] in programs:
+        name, *arguments = arguments
+        program = programs[name]
+        if isinstance(program, Program):
+            import_module(f'metagcttt_tools.{program.module}').main(arguments)
+            return
+        prog, description, programs = f'{prog} {name}', program.summary, dict(program.programs)
+    # Help or a mistake is left, and neither takes the programs themselves.
+    tyro.extras.subcommand_cli_from_dict(
+        {name: _described(program.summary) for name, program in programs.items()},
+        args=arguments,
+        prog=prog,
+        description=description,
+    )
+
+
+def _described(summary: str) -> Callable[[], None]:
+    def described() -> None:
+        raise AssertionError('a program that is named was run')
+
+    described.__doc__ = summary
+    return described

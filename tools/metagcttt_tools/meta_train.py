@@ -1,0 +1,114 @@
+"""Meta-post-train a policy so that a few steps of test-time training make it an expert."""
+
+from pathlib import Path
+
+from metagcttt_core import (
+    Agent,
+    CheckpointError,
+    DatasetError,
+    load_checkpoint,
+    MetaConfig,
+    post_train,
+    save_checkpoint,
+    TrajectoryDataset,
+)
+from metagcttt_core.agents.gciql import ActorLoss
+from metagcttt_core.meta import DivergedError, OuterStep, TaskError
+from metagcttt_core.meta.diagnostics import Diagnostics
+from metagcttt_core.meta.health import HealthWatch
+from pydantic import Field
+
+from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.session import (
+    left_behind,
+    process_group,
+    provenance,
+    RunSettings,
+    training_session,
+    use_threads,
+)
+
+_DESCRIPTION = """Meta-post-train a pre-trained policy (Algorithm 1).
+
+Example: metagcttt meta-train --preset pointmaze-medium-navigate-cpu --meta.algorithm fomaml
+Writes OUT/checkpoint, OUT/metrics.jsonl and TensorBoard logs.
+Ctrl-C saves and ends; --resume goes on."""
+
+
+class MetaTrainSettings(RunSettings):
+    """Settings of the tool."""
+
+    checkpoint: Path = Field(Path('out/pretrain/checkpoint'), description='pre-trained policy')
+    out: Path = Field(Path('out/meta'), description='folder of the run')
+    actor_loss: ActorLoss | None = Field(
+        None, description="of a GCIQL policy from here on; the policy's own by default"
+    )
+    meta: MetaConfig = MetaConfig()
+    checkpoint_every: int = Field(100, ge=1, description='outer steps between checkpoints')
+    snapshot_every: int | None = Field(
+        None, ge=1, description='outer steps between policies kept in OUT/snapshots'
+    )
+    cuda_graphs: bool = Field(True, description='on a GPU, replay captured inner steps')
+    log_every: int = Field(10, ge=1, description='outer steps between log lines (means over them)')
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run the tool."""
+    settings = parse(MetaTrainSettings, _DESCRIPTION, 'meta-train', argv)
+    use_threads(settings.threads)
+    try:
+        with process_group(settings.device):
+            _run(settings)
+    except (DatasetError, CheckpointError, TaskError) as error:
+        fail(str(error))
+    except DivergedError as error:
+        fail(f'{error}; {left_behind(settings)}')
+
+
+def _run(settings: MetaTrainSettings) -> None:
+    changes = settings.model_dump(include={'actor_loss'}, exclude_none=True)
+    base = load_checkpoint(settings.checkpoint, changes=changes).to(settings.device)
+    dataset = TrajectoryDataset.load(settings.dataset)
+    decisive = settings.model_dump(mode='json', include={'meta', 'seed', 'threads'})
+    decisive |= settings.model_dump(include={'device', 'actor_loss'}, exclude_defaults=True)
+    decisive['dataset'] = settings.dataset.name
+    base.metadata['history'] = [
+        *base.metadata.get('history', []),
+        {'stage': 'post_train', **decisive, **provenance()},
+    ]
+    steps = settings.meta.outer_steps
+    with training_session(settings, 'post_train', decisive, steps) as session:
+        diagnostics = Diagnostics(base)
+        watch = HealthWatch(session.log.records)
+
+        def on_step(outer: OuterStep, agent: Agent) -> None:
+            session.bar.update()
+            diagnostics.add(outer)
+            if settings.snapshot_every and outer.step % settings.snapshot_every == 0:
+                save_checkpoint(agent, settings.out / 'snapshots' / f'{outer.step:06d}')
+            if outer.step % settings.log_every == 0:
+                record = diagnostics.record(agent)
+                warnings = watch.add(record.means)
+                session.log.write(
+                    outer.step,
+                    record.means,
+                    samples=record.samples,
+                    curves=record.curves,
+                    warnings=warnings,
+                )
+                session.warn(outer.step, warnings)
+                session.bar.set_postfix(train=f'{record.means["inner/last_train_loss"]:.3f}')
+
+        try:
+            post_train(
+                base,
+                dataset,
+                settings.meta,
+                settings.seed,
+                run=session.run,
+                on_step=on_step,
+                cuda_graphs=settings.cuda_graphs,
+            )
+        except DivergedError as error:
+            session.log.write(error.step, {}, warnings=[str(error)])
+            raise

@@ -1,0 +1,61 @@
+"""Pack trained policies and part of their dataset into the small assets that the demo uses."""
+
+from pathlib import Path
+
+from metagcttt_core import (
+    CheckpointError,
+    DatasetError,
+    load_checkpoint,
+    save_checkpoint,
+    TrajectoryDataset,
+)
+from metagcttt_core.config import Settings
+from metagcttt_core.files import atomic_write
+import numpy as np
+from pydantic import Field
+
+from metagcttt_tools.common.cli import fail, parse
+
+_DESCRIPTION = """Pack trained policies and part of their dataset into the assets of the demo.
+
+Example: metagcttt pack-assets --preset pointmaze-medium-navigate-cpu
+Checkpoints lose their optimiser state. The dataset keeps its first trajectories, in half precision
+(1.6 cm at 20 m) and without the simulator's own state, to be small enough for a repository."""
+
+
+class PackSettings(Settings):
+    """Settings of the tool."""
+
+    base: Path = Field(Path('out/pretrain/checkpoint'), description='pre-trained policy')
+    meta: Path = Field(Path('out/meta/checkpoint'), description='post-trained policy')
+    dataset: Path = Field(
+        Path('data/pointmaze-medium-navigate-v0.npz'), description='their dataset (npz)'
+    )
+    episodes: int = Field(500, ge=1, description='trajectories to keep')
+    out: Path = Field(Path('assets/pointmaze-medium-navigate'), description='folder to write')
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run the tool."""
+    settings = parse(PackSettings, _DESCRIPTION, 'pack-assets', argv)
+    try:
+        for name in ('base', 'meta'):
+            save_checkpoint(load_checkpoint(getattr(settings, name)), settings.out / name)
+        pack_dataset(TrajectoryDataset.load(settings.dataset), settings)
+    except (DatasetError, CheckpointError) as error:
+        fail(str(error))
+    for path in sorted(settings.out.rglob('*')):
+        if path.is_file():
+            print(f'{path.stat().st_size / 1e6:6.2f} MB  {path}')
+
+
+def pack_dataset(dataset: TrajectoryDataset, settings: PackSettings) -> None:
+    """Write the first trajectories of `dataset` to `dataset.npz`."""
+    rows = int(dataset.episode_ends[min(settings.episodes, dataset.num_episodes) - 1]) + 1
+    with atomic_write(settings.out / 'dataset.npz') as file:
+        np.savez_compressed(
+            file,
+            observations=dataset.observations[:rows].astype(np.float16),
+            actions=dataset.actions[:rows].astype(np.float16),
+            terminals=dataset.terminals[:rows],
+        )

@@ -1,0 +1,142 @@
+"""Pre-train a goal-conditioned policy on an offline dataset."""
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+from metagcttt_core import Agent, CheckpointError, DatasetError, make_agent, TrajectoryDataset
+from metagcttt_core.agents import AgentName
+from metagcttt_core.agents.gcbc import GCBCSettings
+from metagcttt_core.agents.gciql import GCIQLSettings
+from metagcttt_core.training.numerics import Precision, resolve_precision
+from metagcttt_core.training.pretrain import pretrain, PretrainConfig
+from pydantic import Field, model_validator
+from torch import Tensor
+import tyro
+
+from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.pretraining_metrics import (
+    as_scalars,
+    keep_snapshot,
+    success_rates,
+    Throughput,
+    Validation,
+    validation_data,
+)
+from metagcttt_tools.common.session import provenance, RunSettings, training_session, use_threads
+
+_DESCRIPTION = """Pre-train a goal-conditioned policy on an offline dataset.
+
+Example: metagcttt pretrain --preset pointmaze-medium-navigate-cpu
+Writes OUT/checkpoint, OUT/metrics.jsonl and TensorBoard logs.
+Ctrl-C saves and ends; --resume goes on."""
+
+
+class PretrainSettings(RunSettings):
+    """Settings of the tool."""
+
+    environment: str = Field('pointmaze-medium-v0', description='simulator the policy is for')
+    out: Path = Field(Path('out/pretrain'), description='folder of the run')
+    agent: AgentName = Field('gcbc', description='kind of agent')
+    hidden: tuple[int, ...] = Field((512, 512, 512), description='units of each hidden layer')
+    gcbc: Annotated[GCBCSettings, tyro.conf.AvoidSubcommands] = GCBCSettings()
+    gciql: Annotated[GCIQLSettings, tyro.conf.AvoidSubcommands] = GCIQLSettings()
+    training: PretrainConfig = PretrainConfig()
+    precision: Precision = Field(
+        'float32', description='of matrix products; auto is bfloat16 where the device gains by it'
+    )
+    compiled: bool = Field(False, description='compile the loss: half a minute, then faster steps')
+    checkpoint_every: int = Field(5000, ge=1, description='steps between checkpoints')
+    log_every: int = Field(
+        500, ge=1, description='steps between log lines; with DATASET-val.npz, of its losses too'
+    )
+    snapshot_every: int | None = Field(
+        None, ge=1, description='steps between policies kept in OUT/snapshots'
+    )
+    evaluate_every: int | None = Field(
+        None, ge=1, description='steps between evaluations of the policy in its simulator'
+    )
+    evaluation_episodes: int = Field(10, ge=1, description='episodes per task of an evaluation')
+
+    @property
+    def agent_settings(self) -> dict[str, Any]:
+        """Settings of the chosen agent other than its units."""
+        return getattr(self, self.agent).model_dump(exclude={'hidden'})
+
+    @model_validator(mode='after')
+    def _units_in_one_place(self) -> Self:
+        if 'hidden' in getattr(self, self.agent).model_dump(exclude_defaults=True):
+            raise ValueError(f'{self.agent}.hidden has no effect here; set hidden')
+        return self
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run the tool."""
+    settings = parse(PretrainSettings, _DESCRIPTION, 'pretrain', argv)
+    use_threads(settings.threads)
+    try:
+        _run(settings)
+    except (DatasetError, CheckpointError) as error:
+        fail(str(error))
+
+
+def _run(settings: PretrainSettings) -> None:
+    dataset = TrajectoryDataset.load(settings.dataset)
+    agent = make_agent(
+        settings.agent,
+        obs_dim=dataset.obs_dim,
+        act_dim=dataset.act_dim,
+        hidden=settings.hidden,
+        seed=settings.seed,
+        **settings.agent_settings,
+    ).to(settings.device)
+    decisive = settings.model_dump(
+        mode='json', include={'agent', 'hidden', 'training', 'seed', 'threads'}
+    )
+    decisive |= settings.model_dump(include={'device', 'compiled'}, exclude_defaults=True)
+    precision = resolve_precision(settings.precision, agent)
+    if precision != 'float32':
+        decisive['precision'] = precision
+    decisive['dataset'] = settings.dataset.name
+    agent.metadata = {
+        'environment': settings.environment,
+        'history': [{'stage': 'pretrain', **decisive, **provenance()}],
+    }
+    held_out = validation_data(settings.dataset, dataset)
+    validation = Validation(held_out, settings.training.batch_size, precision)
+    with training_session(settings, 'pretrain', decisive, settings.training.steps) as session:
+        throughput = Throughput()
+
+        def on_step(step: int, losses: dict[str, Tensor], agent: Agent) -> None:
+            session.bar.update()
+            throughput.count()
+            due = partial(_is_due, step)
+            scalars: dict[str, float] = {}
+            if due(settings.log_every):
+                scalars = as_scalars(losses) | {'speed/updates_per_s': throughput.rate()}
+                session.bar.set_postfix(loss=f'{scalars["train/loss"]:.4f}')
+                scalars |= validation.losses(agent, settings.seed, step)
+            if due(settings.evaluate_every):
+                scalars |= success_rates(
+                    agent, settings.environment, settings.evaluation_episodes, settings.seed
+                )
+            if due(settings.snapshot_every):
+                keep_snapshot(agent, settings.out, step)
+            if scalars:
+                session.log.write(step, scalars)
+                throughput.restart()
+
+        pretrain(
+            agent,
+            dataset,
+            settings.training,
+            settings.seed,
+            precision=precision,
+            compiled=settings.compiled,
+            run=session.run,
+            on_step=on_step,
+        )
+
+
+def _is_due(step: int, every: int | None) -> bool:
+    return every is not None and step % every == 0

@@ -1,0 +1,1 @@
+"""Reading MCAP recordings, and what can be seen in them."""

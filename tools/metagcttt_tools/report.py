@@ -1,0 +1,233 @@
+"""Tables and figures of a study (paper, figures 3 to 5 and table 1)."""
+
+import json
+from pathlib import Path
+import shlex
+from typing import Any
+
+from metagcttt_core import normalized_auc, success_statistics
+from metagcttt_core.config import Settings
+from metagcttt_core.evaluation import adaptation_efficiency
+from metagcttt_core.files import write_json
+import numpy as np
+from pydantic import Field
+import tyro
+
+from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.plots import post_training_curves, save, success_curves
+
+_DESCRIPTION = """Tables and figures of a study that metagcttt sweep ran.
+
+Example: metagcttt report out/study --out docs/results/study
+Prints the tables; writes OUT.json, OUT.md, OUT.png and, with a curve, OUT-curve.png."""
+
+BASE = 'base'
+
+
+class ReportSettings(Settings):
+    """Settings of the tool."""
+
+    study: tyro.conf.Positional[Path] = Field(Path('out/study'), description='folder of the study')
+    out: Path | None = Field(None, description='files to write; STUDY/report by default')
+    threshold: float = Field(
+        0.8, gt=0, le=1, description='success rate that adaptation efficiency counts steps to'
+    )
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run the tool."""
+    settings = parse(ReportSettings, _DESCRIPTION, 'report', argv)
+    try:
+        report = read_study(settings.study, settings.threshold)
+    except ValueError as error:
+        fail(str(error))
+    out = settings.out or settings.study / 'report'
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_json(out.with_suffix('.json'), report)
+    text = format_report(report)
+    out.with_suffix('.md').write_text(text, encoding='utf-8')
+    save(success_curves(_panels(report['adaptations'])), out.with_suffix('.png'))
+    if report['curve']:
+        save(post_training_curves(report['curve']), out.with_name(f'{out.name}-curve.png'))
+    print(text)
+
+
+def _panels(adaptations: dict[str, Any]) -> dict[str, Any]:
+    """One panel an adaptation, and another for its arms of fewer seeds."""
+    panels = {}
+    for name, arms in adaptations.items():
+        most = max(len(arm['seeds']) for arm in arms.values())
+        for title, enough in ((name, True), (f'{name}, fewer seeds', False)):
+            chosen = {
+                key: arm for key, arm in arms.items() if (len(arm['seeds']) == most) == enough
+            }
+            if chosen:
+                panels[title] = chosen
+    return panels
+
+
+def read_study(folder: Path, threshold: float = 0.8) -> dict[str, Any]:
+    """What a study found.
+
+    Args:
+        folder: Folder of the study.
+        threshold: Success rate that adaptation efficiency counts steps to.
+
+    Returns:
+        `study` (its settings and versions); `adaptations`: by name of the adaptation and arm the
+        `budgets`, `success` (per budget), `standard_error`, `per_seed` (per budget and seed),
+        `auc`, `auc_error`, `auc_per_seed` and `efficiency`, against the base policies of the same
+        seeds; `curve`: by arm, the same by fraction of the outer
+        steps, 0 being the base policy and 1 the post-trained one.
+
+    Raises:
+        ValueError: If the folder holds no finished study; names the file that is missing.
+    """
+    study = _read_json(folder / 'study.json')
+    settings = study['settings']
+    adaptations = {}
+    for name in settings['adaptations']:
+        rates = _rates(_read_json(folder / f'evaluation-{name}.json')['results'])
+        arms = {arm: _summary(seeds) for (arm, _), seeds in rates.items()}
+        for arm in arms.values():
+            base = _summary({seed: rates[BASE, 0][seed] for seed in arm['seeds']})
+            efficiency = adaptation_efficiency(_by_budget(base), _by_budget(arm), threshold)
+            arm['efficiency'] = _finite(efficiency)
+        adaptations[name] = arms
+    curve: dict[str, dict[float, Any]] = {}
+    if (folder / 'curve.json').is_file():
+        curve = _curve(folder, settings, next(iter(adaptations.values())))
+    return {'study': study, 'threshold': threshold, 'adaptations': adaptations, 'curve': curve}
+
+
+def _curve(folder: Path, settings: dict[str, Any], final: dict[str, Any]) -> dict[str, Any]:
+    rates = _rates(_read_json(folder / 'curve.json')['results'])
+    budgets = settings['curve_budgets']
+    base = _restrict(final[BASE], budgets)
+    curve: dict[str, dict[float, Any]] = {}
+    for (arm, step), seeds in rates.items():
+        run = _read_json(folder / f'{arm}-{min(seeds)}' / 'settings.json')
+        fraction = step / run['settings']['meta']['outer_steps']
+        curve.setdefault(arm, {0.0: base})[fraction] = _summary(seeds)
+    for arm, points in curve.items():
+        points[1.0] = _restrict(final[arm], budgets)
+    return curve
+
+
+def _restrict(summary: dict[str, Any], budgets: list[int]) -> dict[str, Any]:
+    chosen = [summary['budgets'].index(budget) for budget in budgets]
+    return {
+        name: [summary[name][index] for index in chosen]
+        for name in ('budgets', 'success', 'standard_error')
+    }
+
+
+def _rates(results: list[dict[str, Any]]) -> dict[tuple[str, int], dict[int, dict[int, float]]]:
+    """Success by (arm, outer step; 0 for the last), training seed and budget."""
+    rates: dict[tuple[str, int], dict[int, dict[int, float]]] = {}
+    for result in results:
+        path = Path(result['checkpoint'])
+        snapshot = path.parent.name == 'snapshots'
+        run = path.parent.parent.name if snapshot else path.parent.name
+        arm, seed = run.rsplit('-', 1)
+        step = int(path.name) if snapshot else 0
+        points = {point['budget']: point['success'] for point in result['curve']}
+        rates.setdefault((arm, step), {})[int(seed)] = points
+    return rates
+
+
+def _summary(seeds: dict[int, dict[int, float]]) -> dict[str, Any]:
+    budgets = list(next(iter(seeds.values())))
+    per_seed = np.array([[points[budget] for budget in budgets] for points in seeds.values()])
+    statistics = [success_statistics(column) for column in per_seed.T]
+    aucs = [normalized_auc(budgets, row) for row in per_seed] if len(budgets) > 1 else []
+    auc = success_statistics(aucs) if aucs else None
+    return {
+        'seeds': list(seeds),
+        'budgets': budgets,
+        'success': [point.mean for point in statistics],
+        'standard_error': [point.standard_error for point in statistics],
+        'per_seed': per_seed.T.tolist(),
+        'auc': auc and auc.mean,
+        'auc_error': auc and auc.standard_error,
+        'auc_per_seed': aucs,
+    }
+
+
+def _by_budget(summary: dict[str, Any]) -> dict[int, float]:
+    return dict(zip(summary['budgets'], summary['success'], strict=True))
+
+
+def _finite(ratio: float | None) -> float | str | None:
+    """JSON knows no infinity: a method that needs no step at all says so in words."""
+    return 'no step needed' if ratio == float('inf') else ratio
+
+
+def format_report(report: dict[str, Any]) -> str:
+    """The tables as Markdown, with the commands that made them."""
+    settings = report['study']['settings']
+    command = f'metagcttt report {shlex.quote(settings["out"])}'
+    if report['threshold'] != ReportSettings().threshold:
+        command += f' --threshold {report["threshold"]:g}'
+    parts = [
+        'Success: mean over training seeds ± standard error.',
+        f'```\nmetagcttt sweep --preset {settings["base"]}\n{command}\n```',
+    ]
+    for name, arms in report['adaptations'].items():
+        parts += [f'## Success by steps of test-time training ({name})', _success_table(arms)]
+        parts[-1] += (
+            f'\n\nEfficiency: smallest K with success >= {report["threshold"]:g}, '
+            f'that of the base policies of the same seeds over that of the arm.'
+        )
+    if report['curve']:
+        parts += ['## Success over post-training', _curve_table(report['curve'])]
+    return '\n\n'.join(parts) + '\n'
+
+
+def _success_table(arms: dict[str, Any]) -> str:
+    budgets = next(iter(arms.values()))['budgets']
+    header = [
+        'policy',
+        'seeds',
+        *(f'K = {budget}' for budget in budgets),
+        'AUC',
+        'AUC by seed',
+        'efficiency',
+    ]
+    rows = []
+    for name, arm in arms.items():
+        efficiency = arm['efficiency'] or '-'
+        if isinstance(efficiency, float):
+            efficiency = f'{efficiency:g}x'
+        auc = '' if arm['auc'] is None else f'{arm["auc"]:.3f} ± {arm["auc_error"]:.3f}'
+        aucs = ', '.join(f'{value:.3f}' for value in arm['auc_per_seed'])
+        rows.append([name, str(len(arm['seeds'])), *_cells(arm), auc, aucs, efficiency])
+    return _table(header, rows)
+
+
+def _curve_table(curve: dict[str, Any]) -> str:
+    first = next(iter(curve.values()))
+    budgets = first[next(iter(first))]['budgets']
+    header = ['policy', 'outer steps', *(f'K = {budget}' for budget in budgets)]
+    rows = [
+        [arm, f'{fraction:.0%}', *_cells(point)]
+        for arm, points in curve.items()
+        for fraction, point in points.items()
+    ]
+    return _table(header, rows)
+
+
+def _cells(summary: dict[str, Any]) -> list[str]:
+    pairs = zip(summary['success'], summary['standard_error'], strict=True)
+    return [f'{mean:.2f} ± {error:.2f}' for mean, error in pairs]
+
+
+def _table(header: list[str], rows: list[list[str]]) -> str:
+    lines = [header, ['---'] * len(header), *rows]
+    return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
+
+
+def _read_json(path: Path) -> Any:
+    if not path.is_file():
+        raise ValueError(f'{path} does not exist: run `metagcttt sweep` to its end first')
+    return json.loads(path.read_text(encoding='utf-8'))

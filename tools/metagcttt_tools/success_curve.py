@@ -1,0 +1,129 @@
+"""Success over pre-training steps (the paper's figure 9), from a run's snapshots."""
+
+from collections.abc import Sequence
+from pathlib import Path
+import sys
+from typing import Any
+
+from matplotlib.figure import Figure
+from metagcttt_core import success_statistics
+from metagcttt_core.training.checkpoint import has_checkpoint
+import numpy as np
+from pydantic import Field
+
+from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.plots import COLORS, save
+from metagcttt_tools.common.pretraining_metrics import SNAPSHOTS
+from metagcttt_tools.common.results import markdown_table, write_report
+from metagcttt_tools.evaluate import evaluate, EvaluateSettings, ProtocolSettings
+
+_DESCRIPTION = """Success over the steps of pre-training, by test-time training budget.
+
+Example: metagcttt success-curve --runs out/base-0 out/base-1 --budgets 0 50
+The runs are those of metagcttt pretrain with --snapshot-every, one for each training seed.
+Writes OUT as JSON and a picture beside it. Ctrl-C is safe: --resume goes on."""
+
+
+class SuccessCurveSettings(ProtocolSettings):
+    """Settings of the tool."""
+
+    runs: tuple[Path, ...] = Field(
+        (Path('out/pretrain'),), min_length=1, description='folders of pre-training runs'
+    )
+    budgets: tuple[int, ...] = Field(
+        (0,), min_length=1, description='numbers of gradient steps K of test-time training'
+    )
+    out: Path = Field(Path('out/success_curve.json'), description='file for the results')
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run the tool."""
+    settings = parse(SuccessCurveSettings, _DESCRIPTION, 'success-curve', argv)
+    try:
+        steps = common_steps(settings.runs)
+        evaluation = EvaluateSettings(
+            checkpoints=tuple(snapshot(run, step) for run in settings.runs for step in steps),
+            **settings.model_dump(exclude={'runs'}),
+        )
+        results = evaluate(evaluation)
+    except ValueError as error:
+        fail(str(error))
+    except KeyboardInterrupt:
+        print('interrupted; the same command with --resume goes on', file=sys.stderr)
+        raise SystemExit(130) from None
+    rows = curve_rows(results, steps)
+    write_report(settings.out, settings, {'curve': rows})
+    picture = settings.out.with_suffix('.png')
+    save(curve_picture(rows), picture)
+    print(markdown_table(rows))
+    print(f'results: {settings.out}\npicture: {picture}')
+
+
+def snapshot(run: Path, step: int) -> Path:
+    """Where a run keeps the policy that it had after so many steps."""
+    return run / SNAPSHOTS / f'{step:06d}'
+
+
+def common_steps(runs: Sequence[Path]) -> list[int]:
+    """The steps of the snapshots, ascending; the same in all runs.
+
+    Raises:
+        ValueError: If a run has none, or others than the first.
+    """
+    found = []
+    for run in runs:
+        folders = [path for path in (run / SNAPSHOTS).glob('*') if has_checkpoint(path)]
+        found.append(sorted(int(path.name) for path in folders))
+        if not found[-1]:
+            raise ValueError(f'{run / SNAPSHOTS}: no snapshots; pretrain with --snapshot-every')
+        if found[-1] != found[0]:
+            raise ValueError(f'{run} has snapshots {found[-1]}, but {runs[0]} has {found[0]}')
+    return found[0]
+
+
+def curve_rows(results: Sequence[dict[str, Any]], steps: Sequence[int]) -> list[dict[str, Any]]:
+    """Success by step and budget.
+
+    Args:
+        results: From `evaluate`: for each run one after the other, the snapshots of all steps.
+        steps: Of the snapshots.
+
+    Returns:
+        For each step and budget the mean and its standard error, over the runs where there are
+        several and otherwise over the evaluation seeds.
+    """
+    rows = []
+    for number, step in enumerate(steps):
+        points = zip(*(result['curve'] for result in results[number :: len(steps)]), strict=True)
+        for runs in points:
+            rates = [point['success'] for point in runs]
+            statistics = success_statistics(rates if len(runs) > 1 else runs[0]['per_seed'])
+            rows.append(
+                {
+                    'step': step,
+                    'budget': runs[0]['budget'],
+                    'success': statistics.mean,
+                    'standard_error': statistics.standard_error,
+                }
+            )
+    return rows
+
+
+def curve_picture(rows: Sequence[dict[str, Any]]) -> Figure:
+    """Success against pre-training steps, one line a budget with its standard error."""
+    figure = Figure(figsize=(5, 3.5), layout='constrained')
+    axes = figure.subplots()
+    for number, budget in enumerate(dict.fromkeys(row['budget'] for row in rows)):
+        color = COLORS[number % len(COLORS)]
+        line = [row for row in rows if row['budget'] == budget]
+        x, mean, error = (
+            np.array([row[key] for row in line]) for key in ('step', 'success', 'standard_error')
+        )
+        axes.plot(x, mean, color=color, marker='o', markersize=3.5, label=f'K = {budget}')
+        axes.fill_between(x, mean - error, mean + error, color=color, alpha=0.15, linewidth=0)
+    axes.set_ylim(-0.02, 1.02)
+    axes.set_xlabel('pre-training steps')
+    axes.set_ylabel('success')
+    axes.grid(alpha=0.25)
+    axes.legend(frameon=False)
+    return figure
