@@ -1,6 +1,5 @@
 """Rows of a dataset by where they are: a sorted grid over one or two coordinates."""
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -32,24 +31,12 @@ class SpatialIndex:
         position_dims: tuple[int, ...],
         scale: tuple[float, ...] | None,
         cell_size: float,
-        saved: Mapping[str, np.ndarray] | None = None,
     ) -> None:
-        """Sort the rows of `observations` (N, obs_dim) into cells of `cell_size` (scaled).
-
-        `saved` is what `arrays` returned for the same data and settings; then nothing is sorted.
-        """
+        """Sort the rows of `observations` (N, obs_dim) into cells of `cell_size` (scaled)."""
         self._observations = observations
         self._dims = list(position_dims)
         self._scale = np.ones(len(self._dims)) if scale is None else np.asarray(scale, np.float64)
         self._cell_size = cell_size
-        if saved is not None:
-            self._restore(saved)
-        else:
-            self._build()
-        # Columns of cells that hold any row: a wide ball over a fine grid passes many that do not.
-        self._occupied = np.unique(self._keys // self._stride)
-
-    def _build(self) -> None:
         columns = [self._observations[:, dim] for dim in self._dims[:2]]
         planar = [column * factor for column, factor in zip(columns, self._scale, strict=False)]
         self._origin = np.array([values.min() for values in planar])
@@ -64,32 +51,14 @@ class SpatialIndex:
         self._columns = [column[order] for column in columns]
         self._keys, starts = np.unique(keys[order], return_index=True)
         self._starts = np.append(starts, len(order))
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Everything the index computed, by name, to be kept in a file."""
-        columns = {f'column{axis}': column for axis, column in enumerate(self._columns)}
-        return {
-            'order': self._order,
-            'keys': self._keys,
-            'starts': self._starts,
-            'origin': self._origin,
-            'extent': self._extent,
-            'edges': self._edges,
-            'stride': np.array(self._stride),
-            **columns,
-        }
-
-    def _restore(self, saved: Mapping[str, np.ndarray]) -> None:
-        self._order, self._keys, self._starts = saved['order'], saved['keys'], saved['starts']
-        self._origin, self._extent = saved['origin'], saved['extent']
-        self._edges = saved['edges']
-        self._stride = int(saved['stride'])
-        self._columns = [saved[f'column{axis}'] for axis in range(len(self._origin))]
+        # Columns of cells that hold any row: a wide ball over a fine grid passes many that do not.
+        self._occupied = np.unique(self._keys // self._stride)
 
     @property
     def num_bytes(self) -> int:
         """Memory that the index holds."""
-        return sum(array.nbytes for array in self.arrays().values())
+        arrays = (self._order, self._keys, self._starts, self._occupied, *self._columns)
+        return sum(array.nbytes for array in arrays)
 
     def ball(self, point: np.ndarray, radius: float, *, strict: bool = False) -> Neighbours:
         """Rows whose distance to `point` is at most `radius` (below it when `strict`).

@@ -2,14 +2,12 @@
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 import time
 
 import numpy as np
 
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.retrieval.config import FilterConfig
-from metagcttt_core.retrieval.index_file import open_index
 from metagcttt_core.retrieval.spatial_index import SpatialIndex
 from metagcttt_core.retrieval.support import SupportSet
 from metagcttt_core.retrieval.value_cache import ValueCache, ValueFunction
@@ -29,15 +27,12 @@ class TrajectoryFilter:
         self,
         dataset: TrajectoryDataset,
         config: FilterConfig | None = None,
-        index_file: Path | None = None,
     ) -> None:
         """Index `dataset` by its positions.
 
         Args:
             dataset: The offline dataset D.
             config: Selection rule and its settings.
-            index_file: Where to keep the index between runs; made, or made anew when the data have
-                changed. By default it is built in memory.
 
         Raises:
             ValueError: If a position dimension is not one of the dataset's observation dimensions.
@@ -49,11 +44,8 @@ class TrajectoryFilter:
                 f'position_dims {self.config.position_dims} must be below the width of an '
                 f'observation, which is {dataset.obs_dim} in this dataset'
             )
-        if index_file is None:
-            dims, scale = self.config.position_dims, self.config.scale
-            self._index = SpatialIndex(dataset.observations, dims, scale, self.config.cell_size)
-        else:
-            self._index = open_index(dataset, self.config, Path(index_file))
+        dims, scale = self.config.position_dims, self.config.scale
+        self._index = SpatialIndex(dataset.observations, dims, scale, self.config.cell_size)
         self._value_cache = ValueCache(dataset)
 
     @property

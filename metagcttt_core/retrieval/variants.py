@@ -1,4 +1,14 @@
-"""The selection rules: which sub-trajectories of the dataset fit a state and a goal."""
+"""The selection rules: the sub-trajectories of the dataset that fit a state and a goal.
+
+Each rule cuts at most one sub-trajectory [start, stop) out of a trajectory, scores it, and keeps
+the best. A trajectory and its cut, by row of the dataset:
+
+    first ......... start ................ end ......... last
+      |               |                     |             |
+    episode_starts  nearest to s     best for g, stop - 1   episode_ends
+
+The last row has no next state, so a cut that ends there stops before it.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -7,7 +17,6 @@ import numpy as np
 
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.retrieval.config import FilterConfig
-from metagcttt_core.retrieval.groups import Best, smallest_per_episode
 from metagcttt_core.retrieval.spatial_index import Neighbours
 
 RowValues = Callable[[np.ndarray], np.ndarray]
@@ -19,7 +28,14 @@ _GCTTT_NUM_SELECTED = 10
 
 
 class Task(NamedTuple):
-    """What a rule may look at; `value` gives V(row | g) or is None without a critic."""
+    """A query as the rules see it.
+
+    Attributes:
+        dataset: The offline dataset D.
+        near_state: Rows within epsilon of s.
+        near_goal: Rows within epsilon of g.
+        value: V(. | g) of rows, or None without a critic.
+    """
 
     dataset: TrajectoryDataset
     near_state: Ball
@@ -28,7 +44,13 @@ class Task(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """Scored sub-trajectories [start, stop), ascending; `keep` numbers the chosen ones."""
+    """Scored sub-trajectories, in ascending order.
+
+    Attributes:
+        num_relevant: Trajectories that pass near s.
+        episodes, starts, stops, scores: (n,) each, by sub-trajectory.
+        keep: Positions of the chosen ones in these arrays, ascending.
+    """
 
     num_relevant: int
     episodes: np.ndarray
@@ -36,6 +58,14 @@ class Candidates(NamedTuple):
     stops: np.ndarray
     scores: np.ndarray
     keep: np.ndarray
+
+
+class PerEpisode(NamedTuple):
+    """One row and its value for each trajectory that has any, ascending; (n,) each."""
+
+    episodes: np.ndarray
+    rows: np.ndarray
+    values: np.ndarray
 
 
 def paper(task: Task, config: FilterConfig) -> Candidates:
@@ -47,11 +77,14 @@ def paper(task: Task, config: FilterConfig) -> Candidates:
     else:
         end = _highest_value(task, start.episodes, start.rows)
     starts = start.rows[np.searchsorted(start.episodes, end.episodes)]
-    # The last row of a trajectory has no next state to learn from.
-    stops = np.minimum(end.rows + 1, task.dataset.episode_ends[end.episodes])
     scores = -end.values
     return Candidates(
-        len(start.episodes), end.episodes, starts, stops, scores, _best(scores, config)
+        num_relevant=len(start.episodes),
+        episodes=end.episodes,
+        starts=starts,
+        stops=_stops_after(task, end),
+        scores=scores,
+        keep=_best(scores, config),
     )
 
 
@@ -65,9 +98,13 @@ def random(task: Task, config: FilterConfig) -> Candidates:
     data = task.dataset
     episodes = np.arange(data.num_episodes)
     scores = np.random.default_rng(config.seed).random(len(episodes))
-    keep = _best(scores, config)
     return Candidates(
-        len(episodes), episodes, data.episode_starts, data.episode_ends, scores, keep
+        num_relevant=len(episodes),
+        episodes=episodes,
+        starts=data.episode_starts,
+        stops=data.episode_ends,
+        scores=scores,
+        keep=_best(scores, config),
     )
 
 
@@ -76,9 +113,13 @@ def relevance_only(task: Task, config: FilterConfig) -> Candidates:
     near = task.near_state()
     start = smallest_per_episode(task.dataset.episode_of(near.rows), *near)
     scores = np.random.default_rng(config.seed).random(len(start.episodes))
-    stops = np.maximum(task.dataset.episode_ends[start.episodes], start.rows)
     return Candidates(
-        len(start.episodes), start.episodes, start.rows, stops, scores, _best(scores, config)
+        num_relevant=len(start.episodes),
+        episodes=start.episodes,
+        starts=start.rows,
+        stops=task.dataset.episode_ends[start.episodes],
+        scores=scores,
+        keep=_best(scores, config),
     )
 
 
@@ -88,15 +129,14 @@ def score_only(task: Task, config: FilterConfig) -> Candidates:
     episodes = np.arange(data.num_episodes)
     find_end = _closest_to_goal if task.value is None else _highest_value
     end = find_end(task, episodes, data.episode_starts)
-    stops = np.minimum(end.rows + 1, data.episode_ends[end.episodes])
     scores = -end.values
     return Candidates(
-        len(episodes),
-        end.episodes,
-        data.episode_starts[end.episodes],
-        stops,
-        scores,
-        _best(scores, config),
+        num_relevant=len(episodes),
+        episodes=end.episodes,
+        starts=data.episode_starts[end.episodes],
+        stops=_stops_after(task, end),
+        scores=scores,
+        keep=_best(scores, config),
     )
 
 
@@ -105,7 +145,31 @@ VARIANTS: dict[str, Callable[[Task, FilterConfig], Candidates]] = {
 }
 
 
-def _closest_to_goal(task: Task, episodes: np.ndarray, starts: np.ndarray) -> Best:
+def smallest_per_episode(episodes: np.ndarray, rows: np.ndarray, values: np.ndarray) -> PerEpisode:
+    """The row of the smallest value in each trajectory, the first on ties.
+
+    Args:
+        episodes: (n,) trajectory of each row.
+        rows: (n,) rows, in any order.
+        values: (n,) what to minimise.
+    """
+    if not len(rows):
+        return PerEpisode(episodes, rows, values)
+    keys = values.astype(np.float64)  # of one type with `smallest`, else numpy casts one by one
+    smallest = np.full(episodes.max() + 1, np.inf)
+    np.minimum.at(smallest, episodes, keys)
+    hits = np.flatnonzero(keys == smallest[episodes])
+    hits = hits[np.argsort(rows[hits])]  # few: one per trajectory, and ties
+    firsts = hits[np.flatnonzero(np.diff(episodes[hits], prepend=-1))]
+    return PerEpisode(episodes[firsts], rows[firsts], values[firsts])
+
+
+def _stops_after(task: Task, end: PerEpisode) -> np.ndarray:
+    """Where cuts stop that include their end, unless that is a last row."""
+    return np.minimum(end.rows + 1, task.dataset.episode_ends[end.episodes])
+
+
+def _closest_to_goal(task: Task, episodes: np.ndarray, starts: np.ndarray) -> PerEpisode:
     """Per trajectory the state closest to g from its start on, where that is within epsilon."""
     near = task.near_goal()
     data = task.dataset
@@ -116,7 +180,7 @@ def _closest_to_goal(task: Task, episodes: np.ndarray, starts: np.ndarray) -> Be
     return smallest_per_episode(near_episodes[usable], near.rows[usable], near.distances[usable])
 
 
-def _highest_value(task: Task, episodes: np.ndarray, starts: np.ndarray) -> Best:
+def _highest_value(task: Task, episodes: np.ndarray, starts: np.ndarray) -> PerEpisode:
     """Per trajectory the state of highest V from its start on, as the smallest of -V."""
     rows = _ranges(starts, task.dataset.episode_ends[episodes] + 1)
     return smallest_per_episode(task.dataset.episode_of(rows), rows, -_values(task, rows))
@@ -128,7 +192,7 @@ def _values(task: Task, rows: np.ndarray) -> np.ndarray:
 
 
 def _best(scores: np.ndarray, config: FilterConfig) -> np.ndarray:
-    """Ascending numbers of the best scores: the top k, or p percent; ties to the earlier one."""
+    """Positions of the best scores, ascending: the top k, or p percent; ties to the earlier."""
     if config.top_k is not None:
         count = config.top_k
     else:
@@ -137,7 +201,14 @@ def _best(scores: np.ndarray, config: FilterConfig) -> np.ndarray:
 
 
 def _gcttt_by_steps(task: Task, config: FilterConfig) -> Candidates:
-    """Rank by the fewest steps from a match of s to the first later match of g."""
+    """Rank by the fewest steps from a match of s to the first later match of g.
+
+    Matches are rows within epsilon. Of each trajectory the pair of matches with the fewest steps
+    in between is cut, with `slack` more steps behind the goal:
+
+        ... s ... s --- steps --> g --- slack --> stop ...
+                start
+    """
     data = task.dataset
     near_s = np.sort(task.near_state(strict=True).rows)
     near_g = np.sort(task.near_goal(strict=True).rows)

@@ -81,17 +81,6 @@ def test_one_outlier_far_away_does_not_hide_the_rest():
     assert index.nearest(np.array([-3.1e9, 2e9])) == 17
 
 
-def test_kept_arrays_restore_the_same_index():
-    rng = np.random.default_rng(1)
-    observations = rng.normal(size=(100, 3)).astype(np.float32)
-    built = SpatialIndex(observations, (0, 1, 2), (1.0, 2.0, 0.5), 0.3)
-    restored = SpatialIndex(observations, (0, 1, 2), (1.0, 2.0, 0.5), 0.3, saved=built.arrays())
-    for point in observations[:10].astype(np.float64):
-        ours, theirs = built.ball(point, 1.5), restored.ball(point, 1.5)
-        assert ours.rows.tolist() == theirs.rows.tolist()
-        assert ours.distances.tolist() == theirs.distances.tolist()
-
-
 def test_a_wide_ball_over_a_fine_grid_visits_only_columns_that_hold_rows():
     corners = np.array([[0, 0], [1e4, 0], [0, 1e4], [1e4, 1e4]], np.float32)
     index = SpatialIndex(corners, (0, 1), None, 1e-5)  # a thousand million columns
