@@ -2,6 +2,7 @@
 
 import importlib
 from importlib.metadata import version
+import re
 
 from metagcttt_core.config import Settings
 from metagcttt_tools.common.cli import fail, parse, preset_values
@@ -69,6 +70,17 @@ def test_preset_overrides_defaults_and_flags_override_the_preset(preset):
     assert parse_toy(f'--preset={path}') == expected
     settings = parse_toy('--steps', '7', '--preset', path, '--inner.dims', '3')
     assert settings == Toy(steps=7, inner=Inner(rate=0.25, dims=(3,)))
+
+
+def test_overrides_come_between_the_preset_and_the_flags(preset, tmp_path, monkeypatch):
+    path = preset('toy:\n  steps: 5\n  inner: {rate: 0.25, dims: [3]}\n')
+    overrides = tmp_path / 'overrides.yaml'
+    overrides.write_text('toy: {steps: 2, inner: {dims: [4]}}\nother: {}\n')
+    monkeypatch.setenv('METAGCTTT_OVERRIDES', str(overrides))
+    assert parse_toy('--preset', path) == Toy(steps=2, inner=Inner(rate=0.25, dims=(4,)))
+    assert parse_toy('--steps', '7').steps == 7
+    overrides.write_text('other: {}\n')
+    assert parse_toy('--preset', path).steps == 5
 
 
 def test_arguments_of_the_process_are_the_default(monkeypatch):
@@ -186,8 +198,9 @@ def test_every_program_teaches_and_reads_the_section_of_its_name(name, monkeypat
 
 @pytest.mark.parametrize('preset_name', preset_names())
 def test_every_section_of_every_preset_fits_its_program(preset_name, monkeypatch):
+    names = {re.sub(r'\W', '_', name): name for name in programs()}
     for section, values in load_preset(preset_name).items():
-        model, *_ = asked_settings(section.replace('_', '-'), monkeypatch)
+        model, *_ = asked_settings(names[section], monkeypatch)
         settings = model.model_validate(values)
         given = settings.model_dump(mode='json', exclude_unset=True)
         assert given.keys() == values.keys()
@@ -198,7 +211,7 @@ def test_every_section_of_every_preset_fits_its_program(preset_name, monkeypatch
     [
         ('generate', 'antmaze-medium-navigate-study', 'paper-'),
         ('pack-assets', 'pointmaze-medium-navigate-cpu', 'study'),
-        ('demo', '', '--preset NAME_OR_PATH'),
+        ('presets', '', '--preset NAME_OR_PATH'),
     ],
 )
 def test_help_offers_the_presets_that_the_program_can_run(name, listed, unlisted, capsys):

@@ -1,6 +1,7 @@
 """Command lines from typed settings: defaults, then a preset, then flags."""
 
 from collections.abc import Sequence
+import os
 import re
 import sys
 from typing import Annotated, Any, NoReturn, TypeVar
@@ -75,18 +76,42 @@ def _preset_help(section: str) -> str:
 
 
 def preset_values(name: str | None, section: str) -> dict[str, Any]:
-    """What a preset says about one tool; nothing without a preset."""
-    if name is None:
-        return {}
-    values = load_preset(name)
-    if section not in values:
-        raise ValueError(f'preset {name} has no section {section!r}; it has: {", ".join(values)}')
-    if not isinstance(values[section], dict):
+    """The values for one program in a preset, with those of METAGCTTT_OVERRIDES over them.
+
+    Args:
+        name: Name or path of the preset; without one there are no values but the overrides.
+        section: Key of the program's values.
+
+    Raises:
+        ValueError: If there is no such preset, or no such section in the one that is named.
+    """
+    values = {} if name is None else _section(name, section)
+    overrides = os.environ.get('METAGCTTT_OVERRIDES')
+    if overrides and section in load_preset(overrides):
+        values = _merged(values, _section(overrides, section))
+    return values
+
+
+def _section(name: str, section: str) -> dict[str, Any]:
+    preset = load_preset(name)
+    if section not in preset:
+        raise ValueError(f'preset {name} has no section {section!r}; it has: {", ".join(preset)}')
+    if not isinstance(preset[section], dict):
         raise ValueError(
             f'preset {name}: {section} must hold a mapping of settings, '
-            f'got {type(values[section]).__name__}'
+            f'got {type(preset[section]).__name__}'
         )
-    return values[section]
+    return preset[section]
+
+
+def _merged(values: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]:
+    """`values` with `overrides` in their place; mappings are merged key by key."""
+    return values | {
+        key: _merged(values[key], value)
+        if isinstance(value, dict) and isinstance(values.get(key), dict)
+        else value
+        for key, value in overrides.items()
+    }
 
 
 def fail(*lines: str) -> NoReturn:

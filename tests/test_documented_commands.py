@@ -1,0 +1,111 @@
+"""Every command in the documentation runs to its end, on settings that take seconds.
+
+`METAGCTTT_OVERRIDES=quick` makes them short. What cannot run here is listed with its reason.
+"""
+
+import os
+from pathlib import Path
+import re
+import shlex
+import subprocess
+
+from markdown_it import MarkdownIt
+import numpy as np
+import pytest
+
+from tests.core.builders import DATA
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = ('README.md', 'CONTRIBUTING.md', 'docs/guide.md')
+# What the documents take for granted: before their blocks, and before what prose names.
+BEFORE_BLOCKS = {
+    'README.md': ['metagcttt generate --kind stitch'],
+}
+BEFORE_PROSE = {
+    'README.md': ['metagcttt meta-train --preset pointmaze-medium-navigate-cpu'],
+    'docs/guide.md': [
+        'metagcttt generate --kind navigate',
+        'metagcttt pretrain',
+        'metagcttt meta-train',
+        *(f'metagcttt pretrain --out out/base-{seed} --seed {seed}' for seed in (0, 1)),
+    ],
+}
+NOT_RUN = {
+    r'make (demo|test|setup|assets).*': 'tests of their own, or this very run',
+    r'source .*': 'sets up a shell',
+    r'\.venv/bin/python -m ruff format \.': 'changes the tree',
+    r'tensorboard .*': 'a server',
+    r'python3? -m (venv|colcon) .*': 'needs ROS 2 of the machine',
+    r'(pip install|cd ros2_ws).*': 'needs ROS 2 of the machine',
+    r'ros2 (launch|topic|run) .*': 'needs ROS 2 of the machine',
+    r'tools/ros2run .*': 'tests/ros/test_documentation.py runs them',
+    r'metagcttt download .*': 'needs the network; tests/tools/test_download.py has a stand-in',
+    r'np\.savez.*': 'is of the JAX program',
+    r'python -m torch\.distributed\.run .*': 'tests/tools/common/test_session.py runs it',
+    r'metagcttt (report|sweep|evaluate-ros)( .*)?': 'tests/tools has them on a small study',
+}
+
+
+def commands_of(document: str) -> tuple[list[str], list[str]]:
+    """The shell commands in the blocks of a document, and those of metagcttt in its prose."""
+    blocks, prose = [], []
+    for token in MarkdownIt('commonmark').enable('table').parse((ROOT / document).read_text()):
+        if token.type == 'fence' and not token.info:
+            lines = token.content.replace('\\\n', '').splitlines()
+            blocks += [line.split('  #')[0].split('     #')[0].strip() for line in lines]
+        for child in token.children or ():
+            if child.type == 'code_inline' and child.content.startswith('metagcttt '):
+                prose.append(' '.join(child.content.split()))
+    return [line for line in blocks if line and line[0] != '#'], prose
+
+
+def reason_not_to_run(command: str) -> str:
+    return next((why for known, why in NOT_RUN.items() if re.fullmatch(known, command)), '')
+
+
+@pytest.fixture
+def workplace(tmp_path: Path) -> Path:
+    """A folder with what a checkout has, in which commands may write."""
+    for name in ('assets', 'tools', 'constraints.txt'):
+        (tmp_path / name).symlink_to(ROOT / name)
+    with np.load(DATA / 'nets_gciql_ant.npz') as arrays:  # stands for the JAX program's file
+        params = {key.removeprefix('init.'): arrays[key] for key in arrays if 'init.' in key}
+    np.savez(tmp_path / 'params.npz', **params)
+    return tmp_path
+
+
+def run(command: str, workplace: Path) -> None:
+    environment = {
+        **os.environ,
+        'METAGCTTT_OVERRIDES': 'quick',
+        'PATH': f'{ROOT / ".venv" / "bin"}:{os.environ["PATH"]}',
+    }
+    result = subprocess.run(
+        ['bash', '-c', command], cwd=workplace, env=environment, capture_output=True, text=True
+    )
+    assert result.returncode == 0, f'{command}\n{result.stdout[-2000:]}{result.stderr[-4000:]}'
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize('document', DOCUMENTS)
+def test_every_command_runs(document: str, workplace: Path) -> None:
+    blocks, prose = commands_of(document)
+    commands = [
+        *BEFORE_BLOCKS.get(document, []),
+        *(command for command in blocks if not reason_not_to_run(command)),
+        *BEFORE_PROSE.get(document, []),
+        *(command for command in prose if not reason_not_to_run(command)),
+    ]
+    for command in dict.fromkeys(commands):
+        run(command, workplace)
+
+
+def test_reasons_are_needed() -> None:
+    """No reason outlives its command, and the programs that matter are among those that run."""
+    shown = [command for name in DOCUMENTS for part in commands_of(name) for command in part]
+    for known in NOT_RUN:
+        assert any(re.fullmatch(known, command) for command in shown), known
+    ran = {shlex.split(command)[1] for command in shown if not reason_not_to_run(command)}
+    assert {'generate', 'pretrain', 'meta-train', 'evaluate', 'benchmark'} <= ran
