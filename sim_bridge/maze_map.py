@@ -1,4 +1,4 @@
-"""The plan of a maze: which cells are wall, where they lie, how to walk between them."""
+"""The plan of a maze: walls, cell geometry and shortest paths."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 Cell = tuple[int, int]
 """Row and column of a cell, counted from 0 at the corner with the smallest y and x."""
 
-# The order decides which of two equally short ways is taken; it is OGBench's.
+# The order breaks ties between shortest paths, as in OGBench.
 NEIGHBOURS: tuple[Cell, ...] = ((-1, 0), (0, -1), (1, 0), (0, 1))
 
 
@@ -20,7 +20,7 @@ NEIGHBOURS: tuple[Cell, ...] = ((-1, 0), (0, -1), (1, 0), (0, 1))
 class MazeMap:
     """A maze of square cells in the x-y plane, without physics.
 
-    Rows run along y and columns along x, so cell (i, j) has its center at
+    Rows run along y and columns along x, so cell (i, j) has its centre at
     ``origin_xy + unit_m * (j, i)``. A cell owns its lower and left edge, not its upper and right.
 
     Attributes:
@@ -77,7 +77,7 @@ class MazeMap:
         return xmin, xmin + cols * self.unit_m, ymin, ymin + rows * self.unit_m
 
     def contains(self, x: float, y: float) -> bool:
-        """Whether the point (x, y), in metres, lies in some cell, wall or free."""
+        """True if the point (x, y), in metres, lies in some cell, wall or free."""
         xmin, xmax, ymin, ymax = self.extent
         return xmin <= x < xmax and ymin <= y < ymax
 
@@ -95,11 +95,11 @@ class MazeMap:
             )
         rows, cols = self.walls.shape
         i, j = int((y - ymin) / self.unit_m), int((x - xmin) / self.unit_m)
-        # Rounding can lift a point just below the upper edge into the next, missing, cell.
+        # Rounding can lift a point just below the upper edge into a cell that does not exist.
         return min(i, rows - 1), min(j, cols - 1)
 
     def center(self, i: int, j: int) -> tuple[float, float]:
-        """Center (x, y) of cell (i, j) in metres.
+        """Centre (x, y) of cell (i, j) in metres.
 
         Raises:
             ValueError: If there is no such cell.
@@ -108,11 +108,11 @@ class MazeMap:
         return self.origin_xy[0] + j * self.unit_m, self.origin_xy[1] + i * self.unit_m
 
     def is_free(self, x: float, y: float) -> bool:
-        """Whether the point (x, y), in metres, lies in a free cell; False outside the maze."""
+        """True if the point (x, y), in metres, lies in a free cell."""
         return self.contains(x, y) and not self.walls[self.cell(x, y)]
 
     def count_visits(self, points: NDArray[np.floating[Any]]) -> NDArray[np.int64]:
-        """How many of the points, (n, 2) in metres, lie in each cell, shape (rows, cols).
+        """Number of points, (n, 2) in metres, per cell, shape (rows, cols).
 
         Raises:
             ValueError: If a point lies outside the maze; names the first.
@@ -131,23 +131,23 @@ class MazeMap:
         return [(int(i), int(j)) for i, j in np.argwhere(~self.walls)]
 
     def open_cells(self) -> list[Cell]:
-        """Free cells that are not corridor, row by row.
+        """Free cells that are not corridors, row by row.
 
-        A corridor cell has exactly two free neighbours, and they face each other: it is passed
-        through, so OGBench never draws it as the goal of a navigate episode.
+        A corridor cell has exactly two free neighbours, on opposite sides; OGBench never draws
+        one as the goal of a navigate episode.
         """
         return [cell for cell in self.free_cells() if not self._is_corridor(cell)]
 
     def cells_at_distance(self, start: Cell, steps: int) -> list[Cell]:
-        """Free cells that are exactly `steps` cells away from `start` on the shortest way."""
+        """Free cells at a shortest-path distance of exactly `steps` cells from `start`."""
         table = self.distances(start)
         return [(int(i), int(j)) for i, j in np.argwhere(table == steps)]
 
     def distances(self, target: Cell) -> NDArray[np.int64]:
-        """Cells to walk from everywhere to `target`, shape (rows, cols), -1 where no way leads.
+        """Shortest-path distance in cells from each cell to `target`, (rows, cols); -1: none.
 
-        Steps go up, down, left and right through free cells (breadth-first search). The result
-        is kept per target and read-only.
+        Paths go up, down, left and right through free cells (breadth-first search). The result
+        is cached per target and read-only.
 
         Raises:
             ValueError: If there is no such cell.
@@ -158,11 +158,11 @@ class MazeMap:
         return self._distances[target]
 
     def next_cell(self, start: Cell, target: Cell) -> Cell:
-        """The cell to head for when walking from `start` to `target`.
+        """The next cell on the shortest path from `start` to `target`.
 
-        It is the neighbour of `start` that lies nearer to `target` (of two such neighbours the
-        first in the order row before, column before, row after, column after), or `start` itself
-        when it is the target or no way leads there. Same rule as OGBench's `get_oracle_subgoal`.
+        Of two equally near neighbours it is the first in the order row before, column before,
+        row after, column after, as in OGBench's `get_oracle_subgoal`; `start` itself when it is
+        the target or cannot reach it.
         """
         table = self.distances(target)
         best = start

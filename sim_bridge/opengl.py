@@ -1,4 +1,4 @@
-"""Choose an OpenGL library for MuJoCo on a machine without a display."""
+"""Choice of an OpenGL library for MuJoCo on machines without a display."""
 
 import ctypes.util
 import os
@@ -9,11 +9,10 @@ HEADLESS_LIBRARIES = {'egl': 'EGL', 'osmesa': 'OSMesa'}
 
 
 def choose_opengl_library() -> None:
-    """Set MUJOCO_GL for this process if nobody did and there is no display.
+    """Set MUJOCO_GL for this process if it is unset and there is no display.
 
-    MuJoCo reads the variable once, when it is first imported, so this must run before that; later
-    it does nothing. Without a suitable library nothing is set: the physics works, drawing does
-    not.
+    MuJoCo reads the variable when it is first imported; later calls do nothing. Without a
+    suitable library nothing is set, and rendering fails while the physics works.
     """
     if 'mujoco' in sys.modules:
         return
@@ -27,10 +26,10 @@ def choose_opengl_library() -> None:
 
 
 def rendering_help() -> str:
-    """What to do when drawing fails, in one sentence."""
+    """Advice for when rendering fails, in one sentence."""
     setting = os.environ.get('MUJOCO_GL', 'unset')
     return (
-        f'MuJoCo cannot draw here (MUJOCO_GL is {setting}): install EGL or OSMesa '
+        f'MuJoCo cannot render here (MUJOCO_GL is {setting}): install EGL or OSMesa '
         '(libegl1 or libosmesa6 on Debian and Ubuntu) and set MUJOCO_GL to egl or osmesa '
         'before Python starts'
     )

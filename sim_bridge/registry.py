@@ -1,4 +1,4 @@
-"""Simulators by name."""
+"""The registry of simulators, by name."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from sim_bridge.simulator import MazeDescription, Simulator
 
 @dataclass(frozen=True)
 class Family:
-    """Simulators that one module offers.
+    """The simulators of one module.
 
     Attributes:
-        names: Lists the names of its mazes.
-        canonical_name: Turns any accepted spelling into one of the names, others into None.
-        describe: Spec, plan and tasks of a named maze, without physics.
+        names: Returns the names of its mazes.
+        canonical_name: Maps any accepted spelling to one of the names, others to None.
+        describe: Returns spec, plan and tasks of a named maze, without physics.
         make: Builds the simulator of a named maze.
     """
 
@@ -43,7 +43,7 @@ FAMILIES: tuple[Family, ...] = (
 
 
 def environment_names() -> tuple[str, ...]:
-    """Every name that `make_simulator` takes."""
+    """Every name that `make_simulator` accepts."""
     return tuple(name for family in FAMILIES for name in family.names())
 
 
@@ -51,11 +51,11 @@ def make_simulator(name: str) -> Simulator:
     """Build the simulator of a maze.
 
     Args:
-        name: One of `environment_names()`, or the name of an OGBench dataset, which stands for
-            the maze it was made in (`pointmaze-medium-navigate-v0` for `pointmaze-medium-v0`).
+        name: One of `environment_names()`, or the name of an OGBench dataset, which means the
+            maze it was recorded in (`pointmaze-medium-navigate-v0` for `pointmaze-medium-v0`).
 
     Returns:
-        A simulator that waits for `reset`.
+        A simulator without an episode; call `reset`.
 
     Raises:
         ValueError: If the name is unknown; names the nearest known one.
@@ -65,7 +65,7 @@ def make_simulator(name: str) -> Simulator:
 
 
 def describe_environment(name: str) -> MazeDescription:
-    """Spec, plan and tasks of a maze, in microseconds and without loading its physics.
+    """Spec, plan and tasks of a maze, without loading its physics.
 
     Raises:
         ValueError: If the name is unknown.

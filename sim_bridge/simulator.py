@@ -1,4 +1,4 @@
-"""The interface that every maze simulator implements, and the values it speaks in."""
+"""The simulator interface: every maze implements it."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -12,22 +12,22 @@ Array = NDArray[np.float64]
 
 
 class SimulatorError(RuntimeError):
-    """A simulator was used in an order or on a machine that it cannot serve."""
+    """A simulator was used out of order, or on a machine that cannot run it."""
 
 
 @dataclass(frozen=True)
 class SimulatorSpec:
-    """What a simulator is, known without running it.
+    """Static properties of a simulator, known without running it.
 
     Attributes:
         name: Name that `make_simulator` takes.
-        obs_dim: Numbers in an observation.
-        act_dim: Numbers in an action, each within -1 to 1.
+        obs_dim: Length of an observation.
+        act_dim: Length of an action, each value in [-1, 1].
         max_episode_steps: Control steps after which a task episode is truncated.
         control_period_s: Simulated seconds per control step.
         goal_tolerance_m: A task is solved within this distance of its goal, in metres.
         num_tasks: Evaluation tasks, numbered from 1.
-        position_dims: Where x and y, in metres, stand in an observation.
+        position_dims: Indices of x and y, in metres, in an observation.
     """
 
     name: str
@@ -42,13 +42,13 @@ class SimulatorSpec:
 
 @dataclass(frozen=True)
 class Task:
-    """One evaluation task; start and goal are noisy around these points at every reset.
+    """One evaluation task; every reset adds noise to its start and goal.
 
     Attributes:
         task_id: Number of the task, from 1.
         name: Short name, such as `task1`.
-        start_xy: Center of the start cell, (x, y) in metres.
-        goal_xy: Center of the goal cell, (x, y) in metres.
+        start_xy: Centre of the start cell, (x, y) in metres.
+        goal_xy: Centre of the goal cell, (x, y) in metres.
     """
 
     task_id: int
@@ -68,14 +68,14 @@ class MazeDescription:
 
 @dataclass(frozen=True, slots=True)
 class StepResult:
-    """What one control step led to.
+    """Outcome of one control step.
 
     Attributes:
         observation: Observation after the step, shape (obs_dim,), float64.
         terminated: The task's goal is reached; the episode is over.
         truncated: The step limit of the task episode is reached; the episode is over.
-        success: The position is within the goal tolerance of the goal that is set.
-        clipped: The action lay outside -1 to 1 and was cut to it before use.
+        success: The position is within the tolerance of the current goal.
+        clipped: The action was outside [-1, 1] and was clipped.
     """
 
     observation: Array
@@ -88,12 +88,12 @@ class StepResult:
 class Simulator(ABC):
     """One robot in one maze.
 
-    An episode is started by `reset` (a task, which ends by success or by the step limit) or by
-    `reset_free` (no task, which never ends). Everything random comes from the seed given there;
-    without a seed the random streams go on from where they are (they start at seed 0), so a
+    `reset` starts an episode of a task, which ends on success or at the step limit;
+    `reset_free` starts one without a task, which never ends. All randomness derives from the
+    seed given there. Without a seed the random streams continue (they start at seed 0), so a
     program that resets in the same order sees the same episodes.
 
-    Positions are metres in the frame of the maze, x to the right and y up on its plan.
+    Positions are in metres in the maze frame: x to the right and y up on its plan.
     """
 
     spec: SimulatorSpec
@@ -106,7 +106,7 @@ class Simulator(ABC):
 
         Args:
             task_id: Task from 1 to `spec.num_tasks`; None draws one.
-            seed: Seed of the start noise, the goal noise and all later randomness.
+            seed: Random seed of the start, the goal and the episode.
 
         Returns:
             Observation and goal observation, both of shape (obs_dim,), float64.
@@ -125,9 +125,8 @@ class Simulator(ABC):
         `set_goal` gives one; from then on `success` tells whether the robot is at it.
 
         Args:
-            seed: Seed of the start and of all later randomness.
-            start_xy: Where to put the robot, in metres; None draws a free cell and a place
-                near its center.
+            seed: Random seed of the start and the episode.
+            start_xy: Start position in metres; None draws one near the centre of a free cell.
 
         Returns:
             Observation of shape (obs_dim,), float64.
@@ -141,7 +140,7 @@ class Simulator(ABC):
         """Apply an action for one control period.
 
         Args:
-            action: Shape (act_dim,); values beyond -1 to 1 are cut, as OGBench's evaluation does.
+            action: Shape (act_dim,); clipped to [-1, 1], as OGBench's evaluation does.
 
         Raises:
             ValueError: If the action has another shape or is not finite; nothing moves then.
@@ -163,7 +162,7 @@ class Simulator(ABC):
     @property
     @abstractmethod
     def position(self) -> tuple[float, float]:
-        """Where the robot is now, (x, y) in metres."""
+        """Current position of the robot, (x, y) in metres."""
 
     @property
     @abstractmethod
@@ -177,10 +176,10 @@ class Simulator(ABC):
 
     @abstractmethod
     def render(self) -> NDArray[np.uint8]:
-        """Picture of the maze from above, shape (height, width, 3).
+        """Image of the maze from above, shape (height, width, 3).
 
         Raises:
-            SimulatorError: If this machine cannot draw without a display; says what to set.
+            SimulatorError: If this machine cannot render; says what to set.
         """
 
     @abstractmethod

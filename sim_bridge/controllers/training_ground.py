@@ -13,7 +13,7 @@ Robot = Literal['ant', 'humanoid']
 
 @dataclass(frozen=True, slots=True)
 class TrackStep:
-    """What one control step led to.
+    """Outcome of one control step.
 
     Attributes:
         observation: The robot's own state without x and y, then the direction as (x, y).

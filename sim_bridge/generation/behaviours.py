@@ -1,4 +1,4 @@
-"""What the behaviour policy of a dataset is after: OGBench's navigate, stitch and explore."""
+"""Behaviour policies of offline data: OGBench's navigate, stitch and explore."""
 
 from abc import ABC, abstractmethod
 from typing import Literal
@@ -12,29 +12,28 @@ Kind = Literal['navigate', 'stitch', 'explore']
 
 STITCH_CELLS = 4
 NOISE = 0.25
-"""Starts and goals lie uniformly within this share of a cell of its center, in x and in y."""
+"""Starts and goals are uniform within this fraction of a cell around its centre, per axis."""
 EXPLORE_STEPS = 10
 
 
 class Behaviour(ABC):
-    """Chooses start, goals and the direction to walk in, for one episode.
+    """Chooses the start, the goals and the direction to walk in, for one episode.
 
     Source: OGBench, `data_gen_scripts/generate_locomaze.py`.
 
     Attributes:
-        start_xy: Where the episode starts, (x, y) in metres.
-        goals_reached: How often the robot came to a goal it was after.
+        start_xy: Start of the episode, (x, y) in metres.
+        goals_reached: Number of goals reached so far.
     """
 
     def __init__(self, maze: MazeMap, rng: np.random.Generator, to_goal: bool = False) -> None:
-        """Draw the start: a free cell, and a place near its center.
+        """Draw the start: a free cell, and a point near its centre.
 
         Args:
-            maze: Where to walk.
-            rng: Source of everything random.
+            maze: The maze to walk in.
+            rng: Source of randomness.
             to_goal: In the goal's cell, walk to the goal itself. OGBench walks to the cell's
-                center, and a robot that keeps to it well may linger there for long, beside the
-                goal.
+                centre, where a robot that follows well lingers beside the goal.
         """
         self.maze = maze
         self.rng = rng
@@ -53,14 +52,14 @@ class Behaviour(ABC):
 
     @abstractmethod
     def at_goal(self, simulator: Simulator) -> None:
-        """Take note that the robot is within the tolerance of the goal that is set."""
+        """Handle arrival within the tolerance of the current goal."""
 
     def draw(self, cells: list[Cell]) -> Cell:
-        """Draw one of the cells, each equally likely."""
+        """Draw one of the cells uniformly."""
         return cells[self.rng.integers(len(cells))]
 
     def near_center(self, cell: Cell) -> tuple[float, float]:
-        """Draw a point around the center of a cell."""
+        """Draw a point near the centre of a cell."""
         x, y = self.maze.center(*cell)
         reach_m = NOISE * self.maze.unit_m
         dx, dy = self.rng.uniform(-reach_m, reach_m, size=2)
@@ -68,7 +67,7 @@ class Behaviour(ABC):
 
 
 class _GoalSeeker(Behaviour):
-    """Walks from cell to cell on the shortest way to a goal."""
+    """Walks from cell to cell along the shortest path to a goal."""
 
     def __init__(self, maze: MazeMap, rng: np.random.Generator, to_goal: bool = False) -> None:
         """Draw start and goal."""
@@ -76,12 +75,12 @@ class _GoalSeeker(Behaviour):
         self._goal_cell = self._draw_goal()
 
     def begin(self, simulator: Simulator) -> None:
-        """Set the goal near the center of its cell."""
+        """Set the goal near the centre of its cell."""
         self._goal_xy = self.near_center(self._goal_cell)
         simulator.set_goal(self._goal_xy)
 
     def direction(self, simulator: Simulator, row: int) -> Array:
-        """Unit vector to the center of the next cell; on arrival, of the goal's cell or to it."""
+        """Unit vector to the centre of the next cell on the path, at last to the goal's."""
         position = simulator.position
         cell = self.maze.cell(*position)
         if self.to_goal and cell == self._goal_cell:
@@ -96,7 +95,7 @@ class _GoalSeeker(Behaviour):
 
 
 class Navigate(_GoalSeeker):
-    """One goal after another, drawn from all free cells that are not corridor."""
+    """One goal after another, drawn from the free cells that are not corridors."""
 
     def at_goal(self, simulator: Simulator) -> None:
         """Count the goal and set the next one."""
@@ -109,7 +108,7 @@ class Navigate(_GoalSeeker):
 
 
 class Stitch(_GoalSeeker):
-    """One goal exactly four cells away (the start's own cell if there is none); it stays there."""
+    """One goal exactly four cells away (the start's cell if there is none), then stays there."""
 
     def at_goal(self, simulator: Simulator) -> None:
         """Count the goal once."""
@@ -128,13 +127,13 @@ class Explore(Behaviour):
         """Leave the episode without a goal."""
 
     def direction(self, simulator: Simulator, row: int) -> Array:
-        """Return the direction of this stretch of ten steps."""
+        """Unit vector of the current stretch of ten steps."""
         if row % EXPLORE_STEPS == 0:
             self._direction = _unit(self.rng.standard_normal(2))
         return self._direction
 
     def at_goal(self, simulator: Simulator) -> None:
-        """Do nothing: there is no goal to be at."""
+        """Do nothing: there is no goal."""
 
 
 BEHAVIOURS: dict[Kind, type[Behaviour]] = {
@@ -145,5 +144,5 @@ BEHAVIOURS: dict[Kind, type[Behaviour]] = {
 
 
 def _unit(vector: Array) -> Array:
-    # OGBench's guard against division by zero; it shortens the vector by a millionth part.
+    # OGBench's guard against division by zero; shortens the vector by a millionth.
     return vector / (np.linalg.norm(vector) + 1e-6)

@@ -1,4 +1,4 @@
-"""Finished parts of a dataset under way, kept in a folder until the dataset is whole."""
+"""Resumable storage of a dataset in progress: finished chunks in a folder."""
 
 from dataclasses import dataclass
 import json
@@ -18,11 +18,11 @@ _SETTINGS = 'settings.json'
 
 
 class GenerationError(ValueError):
-    """A dataset cannot be generated, or not gone on with; the message says what to do."""
+    """A dataset that cannot be generated or resumed; the message says what to do."""
 
 
 def refuse_difference(path: Path, stored: dict[str, Any], asked: dict[str, Any]) -> None:
-    """Refuse to mix two settings in one dataset.
+    """Refuse to resume a dataset with other settings.
 
     Raises:
         GenerationError: If a setting differs; names the first one, both values and the path.
@@ -31,14 +31,14 @@ def refuse_difference(path: Path, stored: dict[str, Any], asked: dict[str, Any])
         was, now = stored.get(key), asked.get(key)
         if was != now:
             raise GenerationError(
-                f'{path} was made with {key} {was!r}, now {now!r} is asked for: ask for the same '
-                'again, choose another output, or overwrite it'
+                f'{path} was generated with {key} {was!r}, not {now!r}: use the same settings, '
+                'choose another output, or overwrite it'
             )
 
 
 @dataclass(frozen=True, order=True)
 class Chunk:
-    """Training or validation episodes from `start` up to but without `stop`."""
+    """Training or validation episodes [start, stop)."""
 
     validation: bool
     start: int
@@ -52,7 +52,7 @@ class Chunk:
 
 
 def plan_chunks(plan: GenerationPlan) -> list[Chunk]:
-    """Cut a dataset into chunks; the same for any number of processes."""
+    """Split a dataset into chunks, independently of the number of processes."""
     return [
         Chunk(validation, start, min(start + plan.chunk_episodes, total))
         for validation, total in ((False, plan.episodes), (True, plan.validation_episodes))
@@ -61,20 +61,20 @@ def plan_chunks(plan: GenerationPlan) -> list[Chunk]:
 
 
 class ChunkFolder:
-    """Folder of the chunks finished so far, with the settings they were made by.
+    """Folder of the chunks finished so far, with the settings that produced them.
 
-    A chunk file is either whole or not there, whenever the process that writes it ends.
+    A chunk file is complete or absent, whenever the process that writes it dies.
     """
 
     def __init__(self, path: Path) -> None:
-        """Point to a folder, which need not exist."""
+        """Refer to a folder, which need not exist."""
         self.path = path
 
     def open(self, settings: dict[str, Any]) -> None:
-        """Create the folder, or go on with it if it was made by the same settings.
+        """Create the folder, or reopen it if its settings are the same.
 
         Raises:
-            GenerationError: If it was made by other settings; names the first that differs.
+            GenerationError: If its settings differ; names the first that does.
         """
         file = self.path / _SETTINGS
         if file.exists():
@@ -84,11 +84,11 @@ class ChunkFolder:
         write_json(file, settings)
 
     def exists(self) -> bool:
-        """Whether a dataset is under way here."""
+        """True if a dataset is in progress here."""
         return (self.path / _SETTINGS).exists()
 
     def has(self, chunk: Chunk) -> bool:
-        """Whether a chunk is finished."""
+        """True if a chunk is finished."""
         return (self.path / chunk.file_name).exists()
 
     def write(self, chunk: Chunk, episodes: list[Episode]) -> None:
@@ -112,10 +112,8 @@ class ChunkFolder:
             with np.load(path, allow_pickle=False) as arrays:
                 return {name: arrays[name] for name in (*PER_ROW, 'goals_reached')}
         except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
-            raise GenerationError(
-                f'{path} is damaged ({error}): remove it and go on with resume'
-            ) from error
+            raise GenerationError(f'{path} is damaged ({error}): remove it and resume') from error
 
     def remove(self) -> None:
-        """Delete the folder, if it is there."""
+        """Delete the folder if it exists."""
         shutil.rmtree(self.path, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""One episode of offline data, recorded row by row."""
+"""Recording of one episode of offline data."""
 
 from dataclasses import dataclass
 
@@ -11,14 +11,14 @@ from sim_bridge.simulator import Simulator
 
 @dataclass(frozen=True)
 class Episode:
-    """A recorded episode of T transitions, as T + 1 rows; the last row's action leads nowhere.
+    """A recorded episode of T transitions in T + 1 rows; the last row's action is not taken.
 
     Attributes:
         observations: Shape (T + 1, obs_dim), float32.
         actions: Shape (T + 1, act_dim), float32.
         qpos: Generalised positions at each row, shape (T + 1, nq), float32.
         qvel: Generalised velocities at each row, shape (T + 1, nv), float32.
-        goals_reached: How often the robot came to a goal it was after.
+        goals_reached: Number of goals reached so far.
     """
 
     observations: np.ndarray
@@ -29,10 +29,10 @@ class Episode:
 
 
 def episode_generator(seed: int, validation: bool, index: int) -> np.random.Generator:
-    """Return the source of everything random in one episode.
+    """Random generator of one episode.
 
-    It depends on nothing but its arguments, so an episode is the same whichever process records
-    it and however many others are recorded.
+    It depends on its arguments alone, so an episode is the same whichever process records it and
+    however many others are recorded.
     """
     sequence = np.random.SeedSequence(seed, spawn_key=(int(validation), index))
     return np.random.default_rng(sequence)
@@ -49,12 +49,12 @@ def record_episode(
 ) -> Episode:
     """Run the behaviour policy for one episode of `num_rows` rows.
 
-    At every row the follower gets the unit vector the behaviour wants to walk along; Gaussian
-    noise of standard deviation `noise` is added to its action, and the sum is cut to -1 to 1. With
-    `to_goal` it walks to the goals themselves, not to the centers of their cells.
+    At every row the follower is given the behaviour's direction; Gaussian noise of standard
+    deviation `noise` is added to its action, and the sum is clipped to [-1, 1]. With `to_goal` it
+    walks to the goals themselves, not to the centres of their cells.
 
     Source: OGBench, `data_gen_scripts/generate_locomaze.py`. Deviation: the action of the last
-    row is recorded but not simulated, because nothing records where it leads.
+    row is recorded but not simulated, since no row would hold its outcome.
     """
     behaviour = BEHAVIOURS[kind](simulator.maze, rng, to_goal)
     observation = simulator.reset_free(seed=int(rng.integers(2**32)), start_xy=behaviour.start_xy)

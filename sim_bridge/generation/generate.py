@@ -1,4 +1,4 @@
-"""Generate an offline dataset: episodes in parallel, in resumable chunks, one file at the end."""
+"""Generation of offline datasets: parallel, resumable, one file at the end."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -29,45 +29,45 @@ FORMAT_VERSION = 1
 PHYSICS_PACKAGES = ('mujoco', 'numpy', 'ogbench')
 
 Progress = Callable[[int, int], None]
-"""Called with the number of episodes done and the number there will be."""
+"""Called with the number of finished episodes and the total."""
 
 
 @dataclass(frozen=True)
 class OutputPaths:
-    """Where the parts of a dataset go, beside one another."""
+    """Paths of the files that make up a dataset."""
 
     train: Path
 
     def __post_init__(self) -> None:
-        """Refuse a name that the others cannot be derived from."""
+        """Refuse a name without the suffix .npz."""
         if self.train.suffix != '.npz':
             raise GenerationError(f'the output must end in .npz, got {self.train}')
 
     @property
     def validation(self) -> Path:
-        """The validation episodes, by OGBench's naming."""
+        """Validation episodes, named as OGBench names them."""
         return self.train.with_name(f'{self.train.stem}-val.npz')
 
     @property
     def sidecar(self) -> Path:
-        """Settings, versions and statistics; written last, so it marks a whole dataset."""
+        """Settings, versions and statistics; written last, so its presence marks completion."""
         return self.train.with_suffix('.json')
 
     @property
     def partial(self) -> Path:
-        """Folder of the finished chunks while the dataset is under way."""
+        """Folder of the finished chunks while the dataset is in progress."""
         return self.train.with_suffix('.partial')
 
 
 @dataclass(frozen=True)
 class DatasetStatistics:
-    """What a dataset holds; numbers are of the training file unless they say otherwise.
+    """Statistics of a dataset, of the training file unless stated otherwise.
 
     Attributes:
         rows: Rows of the training file.
         validation_rows: Rows of the validation file.
         goals_per_episode: Mean number of goals reached in an episode.
-        coverage: Share of the free cells of the maze that were visited, 0 to 1.
+        coverage: Fraction of the free cells that were visited, 0 to 1.
         falls_per_episode: Mean number of falls in an episode; 0 for a robot that cannot fall.
     """
 
@@ -87,30 +87,30 @@ def generate(
     progress: Progress | None = None,
     controller: Path | None = None,
 ) -> DatasetStatistics:
-    """Generate a dataset in OGBench's format and return what it holds.
+    """Generate a dataset in OGBench's format.
 
     Writes `NAME.npz`, `NAME-val.npz` and, last, `NAME.json` (settings, versions, statistics).
     The files depend on the plan, the controller and the physics packages, not on `processes`.
-    An interruption loses at most the chunks being recorded; `resume` goes on with the others.
+    An interruption loses at most the chunks being recorded; `resume` keeps the others.
 
     Args:
         plan: What to generate.
         output: Path of `NAME.npz`.
         processes: Worker processes; 1 records in this process.
-        resume: Go on with what an earlier call for the same plan left; a dataset that is whole
-            is left as it is.
+        resume: Continue what an earlier call for the same plan left; a complete dataset is left
+            as it is.
         overwrite: Discard what an earlier call left.
-        progress: Told how many episodes are done.
+        progress: Called as episodes finish.
         controller: Folder of the learned controller to use, for a robot that needs one; by
-            default the one that comes with the package.
+            default the bundled one.
 
     Returns:
         Statistics of the dataset.
 
     Raises:
-        GenerationError: If the output exists and neither flag is given, if it was made by other
-            settings than the plan's, or if a worker process died.
-        ControllerError: If the robot needs a controller that is not there.
+        GenerationError: If the output exists and neither flag is given, if it was generated with
+            other settings, or if a worker process died.
+        ControllerError: If the robot needs a controller and there is none.
     """
     if processes < 1:
         raise GenerationError(f'processes must be at least 1, got {processes}')
@@ -145,7 +145,7 @@ def generate(
 
 
 def _settings(plan: GenerationPlan, follower: DirectionFollower) -> dict[str, Any]:
-    """Everything that decides the content of a dataset."""
+    """All settings that determine the content of a dataset."""
     controller = (
         {'controller_sha256': follower.sha256} if isinstance(follower, LearnedFollower) else {}
     )
@@ -165,13 +165,13 @@ def _refuse_existing(paths: OutputPaths) -> None:
 
 
 def _finished(sidecar: Path, settings: dict[str, Any]) -> DatasetStatistics:
-    """Statistics of a dataset that is whole, after checking that it is the one asked for."""
+    """Statistics of a complete dataset, once its settings are verified."""
     try:
         stored = json.loads(sidecar.read_text(encoding='utf-8'))
         statistics = DatasetStatistics(**stored.pop('statistics'))
     except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
         raise GenerationError(
-            f'{sidecar} describes no dataset made here: overwrite it or choose another output'
+            f'{sidecar} describes no generated dataset: overwrite it or choose another output'
         ) from error
     refuse_difference(sidecar, stored, settings)
     return statistics

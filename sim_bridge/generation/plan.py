@@ -1,4 +1,4 @@
-"""What to generate: the settings that decide every byte of a dataset."""
+"""Generation plans: the settings that determine every byte of a dataset."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from sim_bridge.generation.behaviours import Kind
 from sim_bridge.registry import describe_environment
 
 CHUNK_ROWS = 20_000
-"""Rows that are recorded between two writes to disk, rounded down to whole episodes."""
+"""Rows recorded between two writes to disk, rounded down to whole episodes."""
 
 
 class GenerationPlan(BaseModel):
@@ -20,11 +20,11 @@ class GenerationPlan(BaseModel):
     model_config = ConfigDict(frozen=True, extra='forbid', allow_inf_nan=False)
 
     environment: str = Field(description='Name of the maze, as make_simulator takes it.')
-    kind: Kind = Field(description='What the behaviour policy is after.')
+    kind: Kind = Field(description='behaviour policy')
     episodes: int = Field(ge=1, description='Training episodes; a tenth as many validate.')
     rows_per_episode: int = Field(ge=2, description='Rows of an episode; transitions plus one.')
     noise: float = Field(ge=0, description='Standard deviation of the action noise.')
-    seed: int = Field(ge=0, description='Seed of everything random.')
+    seed: int = Field(ge=0, description='Random seed.')
     to_goal: bool = Field(False, description="Walk to the goal, not to its cell's center.")
 
     @property
@@ -47,9 +47,9 @@ def plan_dataset(
     noise: float | None = None,
     to_goal: bool = False,
 ) -> GenerationPlan:
-    """Plan a dataset, with OGBench's size and noise where nothing else is asked for.
+    """Plan a dataset, with OGBench's size and noise by default.
 
-    The mazes of gymnasium-robotics, which OGBench has no data of, get those of its point maze.
+    Mazes of gymnasium-robotics, for which OGBench has no data, get those of its point maze.
 
     Raises:
         ValueError: If the environment is unknown.
@@ -73,7 +73,7 @@ def _ogbench_size(name: str, kind: Kind) -> dict[str, Any]:
     """Episodes, rows and noise of OGBench's dataset of this maze and kind.
 
     Source: OGBench, `data_gen_scripts/commands.sh`. It has no explore data for the point and the
-    humanoid; they get the ant's.
+    humanoid, which get the ant's.
     """
     robot, layout, _ = name.split('-')
     humanoid = robot == 'humanoidmaze'

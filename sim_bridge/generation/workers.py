@@ -1,4 +1,4 @@
-"""Record chunks of a dataset, in this process or in several."""
+"""Recording of dataset chunks, in this process or in several."""
 
 from collections.abc import Iterator
 from concurrent.futures import as_completed, ProcessPoolExecutor
@@ -26,7 +26,7 @@ def record_chunks(
     processes: int,
     controller: Path | None = None,
 ) -> Iterator[Chunk]:
-    """Record chunks into the folder and yield each when it is on disk, in any order.
+    """Record chunks into the folder and yield each once it is on disk, in any order.
 
     `controller` is as in `make_direction_follower`.
 
@@ -48,7 +48,7 @@ def record_chunks(
             yield future.result()
     except BrokenProcessPool as error:
         raise GenerationError(
-            'a worker process died (out of memory?): go on with resume and fewer processes'
+            'a worker process died (out of memory?): resume with fewer processes'
         ) from error
     finally:
         executor.shutdown(cancel_futures=True)
@@ -76,15 +76,15 @@ def _record(
 
 @cache
 def _workbench(environment: str, controller: Path | None) -> tuple[Simulator, DirectionFollower]:
-    """Build simulator and controller once per process."""
+    """Simulator and controller, built once per process."""
     simulator = make_simulator(environment)
     return simulator, make_direction_follower(simulator.spec, controller)
 
 
 def _prepare_worker() -> None:
-    """Leave Ctrl-C to the parent, and end when the parent is gone, however it went.
+    """Leave Ctrl-C to the parent, and exit when the parent is gone.
 
-    Without this, workers of a parent that was killed wait for work forever.
+    Otherwise the workers of a killed parent would wait for work forever.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()

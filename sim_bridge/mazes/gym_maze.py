@@ -1,4 +1,4 @@
-"""What all mazes that wrap a gymnasium environment share: episodes, limits and checks."""
+"""Base of the mazes that wrap a gymnasium environment: episodes, limits and checks."""
 
 from abc import abstractmethod
 from typing import Any
@@ -17,7 +17,7 @@ from sim_bridge.simulator import (
 
 
 class GymMaze(Simulator):
-    """Keeps the book of an episode; a subclass moves the robot.
+    """Tracks episode state; a subclass moves the robot.
 
     Subclasses set `_env`, whose `data` is MuJoCo's, start episodes in `reset` and `reset_free` by
     `_begin`, and implement `_advance`, `_move_goal` and `close`.
@@ -26,7 +26,7 @@ class GymMaze(Simulator):
     _env: Any
 
     def __init__(self, description: MazeDescription) -> None:
-        """Wait for the first reset."""
+        """Start without an episode; `reset` begins one."""
         self.spec = description.spec
         self.maze = description.maze
         self.tasks = description.tasks
@@ -38,15 +38,15 @@ class GymMaze(Simulator):
 
     @abstractmethod
     def _advance(self, action: Array) -> tuple[Array, bool]:
-        """Step the physics; returns the observation and whether the goal that is set is reached.
+        """Step the physics; returns the observation and whether the goal is reached.
 
         Args:
-            action: Shape (act_dim,), each number within -1 to 1.
+            action: Shape (act_dim,), each value in [-1, 1].
         """
 
     @abstractmethod
     def _move_goal(self, xy: Array) -> None:
-        """Move the goal to (x, y), metres, and show it."""
+        """Move the goal and its marker to (x, y), metres."""
 
     def step(self, action: ArrayLike) -> StepResult:
         """Apply an action for one control period; see `Simulator.step`."""
@@ -81,12 +81,12 @@ class GymMaze(Simulator):
 
     @property
     def environment(self) -> Any:
-        """The gymnasium environment behind, without wrappers; for measurements."""
+        """The unwrapped gymnasium environment, for measurements."""
         return self._env
 
     @property
     def position(self) -> tuple[float, float]:
-        """Where the robot is now, (x, y) in metres."""
+        """Current position of the robot, (x, y) in metres."""
         x, y = self._env.data.qpos[:2]
         return float(x), float(y)
 
@@ -101,20 +101,20 @@ class GymMaze(Simulator):
         return np.array(self._env.data.qvel)
 
     def render(self) -> NDArray[np.uint8]:
-        """Picture of the maze from above; see `Simulator.render`."""
+        """Image of the maze from above; see `Simulator.render`."""
         import mujoco
 
         try:
             return self._draw()
         except (mujoco.FatalError, ImportError, RuntimeError, AttributeError) as error:
-            # One of these, depending on which OpenGL library is missing and how.
+            # Which of these depends on the OpenGL library that is missing.
             raise SimulatorError(f'{rendering_help()} ({error})') from error
 
     def _draw(self) -> NDArray[np.uint8]:
         return np.asarray(self._env.render())
 
     def _begin(self, *, is_task: bool) -> None:
-        """Start to count the steps of an episode; one of a task has a goal from the start."""
+        """Begin an episode; one of a task has a goal from the start."""
         self._running = True
         self._num_steps = 0
         self._is_task = self._has_goal = is_task
@@ -138,7 +138,7 @@ class GymMaze(Simulator):
         return int(task_id)
 
     def _bounded(self, action: ArrayLike) -> tuple[Array, bool]:
-        """The action within -1 to 1, and whether it had to be cut."""
+        """The action clipped to [-1, 1], and whether that changed it."""
         values = np.asarray(action, dtype=np.float64)
         if values.shape != (self.spec.act_dim,):
             raise ValueError(f'action must have shape ({self.spec.act_dim},), got {values.shape}')
@@ -150,7 +150,7 @@ class GymMaze(Simulator):
 
 
 def check_seed(seed: int) -> None:
-    """Refuse a seed that NumPy's generators do not take.
+    """Refuse a seed that NumPy's generators do not accept.
 
     Raises:
         ValueError: If it is negative or needs more than 32 bits.

@@ -95,7 +95,7 @@ class Robot:
     """One family of mazes: the robot in it and OGBench's settings for it.
 
     Attributes:
-        obs_dim: Numbers in an observation.
+        obs_dim: Length of an observation.
         act_dim: Numbers in an action.
         control_period_s: Simulated seconds per control step.
         goal_tolerance_m: Distance to the goal that counts as success.

@@ -162,9 +162,9 @@ def test_unfinished_dataset_is_not_touched_without_being_told(unfinished: Path) 
 @pytest.mark.parametrize(
     ('asked', 'message'),
     [
-        (small(9, seed=1), 'made with seed 0, now 1 is asked for'),
-        (small(8), 'made with episodes 9, now 8 is asked for'),
-        (small(9, rows=22), 'made with rows_per_episode 21, now 22'),
+        (small(9, seed=1), 'generated with seed 0, not 1'),
+        (small(8), 'generated with episodes 9, not 8'),
+        (small(9, rows=22), 'generated with rows_per_episode 21, not 22'),
     ],
 )
 def test_resume_with_other_settings_is_refused_by_name(
@@ -186,7 +186,7 @@ def test_resume_with_other_physics_is_refused_by_name(unfinished: Path) -> None:
     settings = unfinished.with_suffix('.partial') / 'settings.json'
     stored = json.loads(settings.read_text())
     settings.write_text(json.dumps({**stored, 'mujoco_version': '0.1'}))
-    with pytest.raises(GenerationError, match=r"made with mujoco_version '0\.1'"):
+    with pytest.raises(GenerationError, match=r"generated with mujoco_version '0\.1'"):
         generate(small(9), unfinished, resume=True)
 
 
@@ -205,7 +205,7 @@ def test_finished_dataset_is_refused_or_left_as_it_is(tmp_path: Path) -> None:
     before = contents(tmp_path)
     with pytest.raises(GenerationError, match=r'maze\.npz exists: overwrite it or choose another'):
         generate(small(), output)
-    with pytest.raises(GenerationError, match=r'maze\.json was made with seed 0, now 1'):
+    with pytest.raises(GenerationError, match=r'maze\.json was generated with seed 0, not 1'):
         generate(small(seed=1), output, resume=True)
     assert generate(small(), output, resume=True) == statistics
     assert contents(tmp_path) == before
@@ -213,7 +213,7 @@ def test_finished_dataset_is_refused_or_left_as_it_is(tmp_path: Path) -> None:
 
 def test_foreign_sidecar_is_refused(tmp_path: Path) -> None:
     (tmp_path / 'maze.json').write_text('[1, 2]')
-    with pytest.raises(GenerationError, match='describes no dataset made here'):
+    with pytest.raises(GenerationError, match='describes no generated dataset'):
         generate(small(), tmp_path / 'maze.npz', resume=True)
 
 
