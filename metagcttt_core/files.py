@@ -1,4 +1,4 @@
-"""Writing files so that a crash leaves the old content or the new, never a part."""
+"""Atomic file writes: a crash leaves the old content or the new, never a part."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -11,9 +11,9 @@ from typing import Any, IO
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[IO[bytes]]:
-    """A binary file that takes the place of `path` when the block ends without an error.
+    """A binary file that replaces `path` when the block ends without an error.
 
-    Missing folders are made. Whatever goes wrong, `path` keeps its old content.
+    Missing folders are created. On any failure, `path` keeps its old content.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
@@ -30,6 +30,6 @@ def atomic_write(path: Path) -> Iterator[IO[bytes]]:
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write JSON with one key per line, whole or not at all."""
+    """Write JSON atomically, one key per line."""
     with atomic_write(path) as file:
         file.write((json.dumps(content, indent=2) + '\n').encode())

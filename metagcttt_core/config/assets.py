@@ -1,4 +1,4 @@
-"""Where the committed checkpoints and datasets are."""
+"""Location of the committed checkpoints and datasets."""
 
 import os
 from pathlib import Path

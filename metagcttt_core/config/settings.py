@@ -1,4 +1,4 @@
-"""The base of every typed setting in the project."""
+"""Base class of all typed settings."""
 
 from difflib import get_close_matches
 from typing import Any

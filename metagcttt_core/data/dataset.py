@@ -1,4 +1,4 @@
-"""Trajectories in memory or memory-mapped: the offline dataset D."""
+"""The offline dataset D: trajectories in memory or memory-mapped."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,7 +20,7 @@ class TrajectoryDataset:
 
         row            0    1    2    3    4    5    6
         observation   s0   s1   s2   s3 | s0   s1   s2
-        action        a0   a1   a2   -  | a0   a1   -      ('-': stored, leads nowhere)
+        action        a0   a1   a2   -  | a0   a1   -      ('-': stored, never taken)
         terminal       F    F    F    T |  F    F    T
         episode_starts 0                   4
         episode_ends                  3              6      (inclusive)
@@ -43,7 +43,7 @@ class TrajectoryDataset:
         extras: Mapping[str, np.ndarray] | None = None,
         source: Path | None = None,
     ) -> None:
-        """Wrap checked arrays; `from_arrays` and `load` check them."""
+        """Wrap validated arrays; `from_arrays` and `load` validate them."""
         self.observations = observations
         self.actions = actions
         self.terminals = terminals
@@ -67,13 +67,13 @@ class TrajectoryDataset:
         *,
         source: Path | None = None,
     ) -> Self:
-        """A dataset over the given rows, after checking every one of them.
+        """A dataset of the given rows, each of them validated.
 
         Args:
             observations: (N, obs_dim) real numbers; kept as they are when float32, else converted.
             actions: (N, act_dim) real numbers.
             terminals: (N,) of booleans or zeros and ones, true on the last row of each trajectory.
-            extras: Further arrays with N rows, stored and saved along.
+            extras: Further arrays with N rows, kept with the dataset.
             source: The file to name in errors.
 
         Raises:

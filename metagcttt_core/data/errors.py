@@ -1,4 +1,4 @@
-"""Errors of data that comes from outside."""
+"""Errors of external data."""
 
 
 class DatasetError(ValueError):

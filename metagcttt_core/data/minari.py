@@ -12,17 +12,17 @@ _PER_ROW_INFOS = ('qpos', 'qvel')
 
 
 def is_minari(path: Path) -> bool:
-    """Whether a path is that of a Minari dataset: its folder, or its file by the suffix."""
+    """True for the path of a Minari dataset: its folder, or its file by the suffix."""
     return path.is_dir() or path.suffix in SUFFIXES
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Rows of a Minari dataset, episodes back to back in the order of their numbers.
+    """Rows of a Minari dataset, episodes back to back by number.
 
     An episode of T transitions has T + 1 observations and T actions, and becomes T + 1 rows::
 
         observations   s0   s1   s2   s3
-        actions        a0   a1   a2   0       (the last row leads nowhere)
+        actions        a0   a1   a2   0       (the last row is never taken)
         terminals       F    F    F    T
 
     Observations that are dictionaries with `observation` and `achieved_goal`, as those of

@@ -37,7 +37,7 @@ def read_arrays(
         with zipfile.ZipFile(path) as archive:
             members = {info.filename.removesuffix('.npy'): info for info in archive.infolist()}
             for name in members:
-                if Path(name).name != name:  # would be unpacked somewhere else
+                if Path(name).name != name:  # would escape the folder
                     raise DatasetError(f'{path}: {name!r} is not a plain array name')
             missing = [name for name in required if name not in members]
             if missing:
@@ -81,7 +81,7 @@ def _read(path: Path, name: str, source: Path | IO[bytes]) -> np.ndarray:
         raise DatasetError(f'{path}: {name} is truncated or damaged ({error})') from error
     except MemoryError as error:
         raise DatasetError(f'{path}: {name} does not fit into memory ({error})') from error
-    except (ValueError, OverflowError, TokenError) as error:  # whatever a bad header leads to
+    except (ValueError, OverflowError, TokenError) as error:  # a bad header leads to any of these
         raise DatasetError(
             f'{path}: {name} cannot be read, it is pickled or damaged ({error})'
         ) from error

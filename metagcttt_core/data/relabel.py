@@ -12,7 +12,7 @@ Batch = dict[str, np.ndarray]
 
 
 class GoalDistribution(Settings):
-    """Where the goal of a transition comes from; the three probabilities sum to 1."""
+    """Distribution of the goal of a transition; the three probabilities sum to 1."""
 
     p_curgoal: float = Field(0.0, ge=0, le=1, description='probability of the current state')
     p_trajgoal: float = Field(

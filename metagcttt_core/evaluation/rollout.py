@@ -14,7 +14,7 @@ from metagcttt_core.retrieval.trajectory_filter import TrajectoryFilter
 
 
 class Simulator(Protocol):
-    """What an evaluation needs of a simulator."""
+    """The part of a simulator that an evaluation uses."""
 
     @property
     def tasks(self) -> Iterable[Any]:
@@ -33,7 +33,7 @@ class Episode:
 
     Attributes:
         task_id: The evaluation task.
-        success: Whether the goal was reached within the limit.
+        success: True if the goal was reached within the limit.
         observations: (T + 1, obs_dim) float64, from the first to the last.
         actions: (T, act_dim) float32.
         supports: The filtered dataset of each adaptation.
@@ -66,7 +66,7 @@ def run_episode(
 
     Args:
         agent: The base policy.
-        simulator: Where to act.
+        simulator: The simulator to act in.
         task_id: The evaluation task.
         seed: Of the simulator's reset and of the adaptation.
         trajectory_filter: Where support sets come from; needed to adapt.
@@ -127,12 +127,12 @@ def evaluate_success(
 
     Args:
         agent: The base policy.
-        simulator: Where to act.
-        dataset: What to adapt on, filtered with the default settings.
+        simulator: The simulator to act in.
+        dataset: The dataset to adapt on, filtered with the default settings.
         ttt: Test-time training; none by default.
         episodes: Episodes per task.
         tasks: Task numbers; all by default.
-        seed: Of the whole evaluation; every episode derives its own.
+        seed: Random seed of the evaluation, from which every episode derives its own.
         trajectory_filter: A filter to use instead of one made from `dataset`.
 
     Returns:

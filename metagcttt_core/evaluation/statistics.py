@@ -63,7 +63,7 @@ def normalized_auc(budgets: Sequence[float], success_rates: Sequence[float]) -> 
 def adaptation_efficiency(
     baseline: Mapping[int, float], method: Mapping[int, float], threshold: float = 0.8
 ) -> float | None:
-    """How many times fewer steps the method needs to reach a success rate than the baseline.
+    """Ratio of the steps that baseline and method need to reach a success rate.
 
     Args:
         baseline: Mean success rate by budget.

@@ -1,4 +1,4 @@
-"""What the paper looks at while post-training: k*, losses, drift, support sizes."""
+"""Diagnostics of post-training: k*, losses, drift, support sizes (paper, figure 8)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,11 +12,11 @@ from metagcttt_core.meta.report import OuterStep, TaskReport
 
 @dataclass(frozen=True)
 class Record:
-    """Some outer steps in numbers, by name.
+    """Figures of some outer steps, by name.
 
     Attributes:
-        means: Over the tasks; None where there is nothing to average. And the drift.
-        samples: A value for each task: k*, support size, redraws.
+        means: Means over the tasks, None where there are no values; and the drift.
+        samples: One value per task: k*, support size, redraws.
         curves: Mean loss over the inner steps (paper, figure 8).
     """
 
@@ -34,11 +34,11 @@ class Diagnostics:
         self._tasks: list[TaskReport] = []
 
     def add(self, outer: OuterStep) -> None:
-        """Take an outer step into the next record."""
+        """Add an outer step to the next record."""
         self._tasks += outer.tasks
 
     def record(self, agent: Agent) -> Record:
-        """The steps added since the last record, and the drift of `agent`."""
+        """A record of the steps added since the last one, with the drift of `agent`."""
         tasks, self._tasks = self._tasks, []
         means = {**_means(tasks), 'meta/drift': self._drift(agent)}
         samples = {

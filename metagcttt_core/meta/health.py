@@ -1,4 +1,4 @@
-"""Signs of a post-training run that goes bad."""
+"""Health of a post-training run: divergence, rejected inner loops, damage."""
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
@@ -17,14 +17,14 @@ _DEVIATIONS = 3.0
 
 
 class DivergedError(RuntimeError):
-    """A loss or a weight became infinite or not a number; the run cannot go on.
+    """A loss or a weight became non-finite; the run cannot continue.
 
     Attributes:
-        step: The outer step it happened in, from 1.
+        step: The outer step in which it happened, from 1.
     """
 
     def __init__(self, step: int, what: str) -> None:
-        """Name what is not finite."""
+        """Name the non-finite value."""
         super().__init__(
             f'outer step {step}: {what} is not finite; a smaller inner_lr or meta_lr usually helps'
         )
@@ -32,7 +32,7 @@ class DivergedError(RuntimeError):
 
 
 def check_finite(outer: OuterStep, agent: Agent) -> None:
-    """Refuse to go on from non-finite numbers.
+    """Refuse to continue from non-finite numbers.
 
     Raises:
         DivergedError: If a loss of the outer step or a weight after it is not finite; names which.
@@ -53,10 +53,10 @@ def _not_finite(outer: OuterStep, agent: Agent) -> Iterator[str]:
 
 
 class HealthWatch:
-    """Looks through the records of a run for rejected inner loops and a damaged initialisation."""
+    """Watches the records of a run for rejected inner loops and a damaged initialisation."""
 
     def __init__(self, records: Iterable[Mapping[str, Any]] = ()) -> None:
-        """Go on from the records so far, means by the names of `diagnostics.Record`."""
+        """Start from the records so far, means by the names of `diagnostics.Record`."""
         self._rejected: deque[float] = deque(maxlen=_WINDOW)
         self._first_losses: list[float] = []
         self._last_losses: deque[float] = deque(maxlen=_WINDOW)
@@ -67,7 +67,7 @@ class HealthWatch:
             self.add(record)
 
     def add(self, means: Mapping[str, Any]) -> list[str]:
-        """Take the next record; returns what has begun to look bad with it, in words."""
+        """Add a record; returns warnings about what it shows."""
         self._rejected.append(means.get('inner/rejected') or 0.0)
         # Without early stopping there is no test loss; the first train batch tells the same.
         losses = (means.get(f'inner/first_{kind}_loss') for kind in ('test', 'train'))

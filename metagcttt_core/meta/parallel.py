@@ -1,6 +1,6 @@
-"""Data-parallel meta-batches: what the processes of `torch.distributed` say to each other.
+"""Data-parallel meta-batches: communication between `torch.distributed` processes.
 
-Without an initialised process group there is one process, and nothing is sent.
+Without an initialised process group there is one process, which sends nothing.
 """
 
 from collections.abc import Iterable, Sequence
@@ -13,19 +13,19 @@ from metagcttt_core.meta.tasks import TaskError
 
 
 def process() -> tuple[int, int]:
-    """The number of this process and how many there are."""
+    """The rank of this process and the number of processes."""
     if distributed.is_available() and distributed.is_initialized():
         return distributed.get_rank(), distributed.get_world_size()
     return 0, 1
 
 
 def first_process() -> bool:
-    """Whether this is the process that writes."""
+    """True in the process that writes."""
     return process()[0] == 0
 
 
 def own_tasks(meta_batch_size: int) -> range:
-    """The numbers of the tasks of a meta-batch that this process adapts to.
+    """Indices of the tasks of a meta-batch that this process adapts to.
 
     Raises:
         TaskError: If there are more processes than tasks.
@@ -42,8 +42,8 @@ def own_tasks(meta_batch_size: int) -> range:
 def mean_over_tasks(parts: Iterable[Sequence[Tensor]]) -> list[Tensor]:
     """The mean over all tasks of all processes.
 
-    Summed in float64, so that the mean of equal tensors is that tensor, to the bit, and the order
-    of the tasks hardly matters.
+    Summed in float64, so that the mean of equal tensors is bit-equal to them and the order of
+    the tasks hardly matters.
 
     Args:
         parts: For each task of this process tensors of the same shapes.
@@ -77,7 +77,7 @@ def reports_of_all(own: list[TaskReport]) -> list[TaskReport]:
 
 
 def any_process(flag: bool, device: torch.device) -> bool:
-    """Whether `flag` is true in any process."""
+    """True if `flag` is true in any process."""
     if process()[1] == 1:
         return flag
     flags = torch.tensor(int(flag), device=device)

@@ -23,7 +23,7 @@ def meta_gradient(
     actor_only: bool = False,
     first_order: bool = False,
 ) -> list[Tensor]:
-    """The gradient of the test loss after the inner steps with respect to the weights before them.
+    """Gradient of the test loss after the inner steps with respect to the initial weights.
 
     Repeats the inner loop as one differentiable function of the initial weights (paper, equation
     6). Target networks follow the weights' values and are constants to the gradient.
@@ -31,7 +31,7 @@ def meta_gradient(
     Args:
         base: The agent that holds the initial weights; not changed.
         train_batches: One batch for each inner step.
-        test_batch: What the test loss is taken on.
+        test_batch: Batch of the test loss.
         lr: Inner learning rate alpha.
         optimizer: Inner optimiser, with a fresh state.
         actor_only: Train the actor alone.

@@ -12,7 +12,7 @@ _MAX_REDRAWS = 10_000
 
 
 class TaskError(ValueError):
-    """Tasks that cannot be found in the dataset, or divided among processes."""
+    """No usable task in the dataset, or too few tasks for the processes."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class MetaTask:
 
     Attributes:
         goal: (obs_dim,) the goal g.
-        train: The split that adapts.
+        train: The split to adapt on.
         test: The split that scores the adapted copy; never empty.
         num_transitions: Size of the filtered dataset.
         redraws: State-goal pairs discarded before this one because the filter found too little.

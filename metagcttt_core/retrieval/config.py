@@ -10,7 +10,7 @@ Variant = Literal['paper', 'gcttt', 'random', 'relevance_only', 'score_only']
 
 
 class FilterConfig(Settings):
-    """How `TrajectoryFilter` chooses sub-trajectories for a state and a goal.
+    """Settings of `TrajectoryFilter`: how it selects sub-trajectories.
 
     Variants: `paper` (appendix A); `gcttt`, the published implementation of GC-TTT; and three
     ablations: `random` trajectories, `relevance_only` (near the state, whatever the goal) and
@@ -22,7 +22,7 @@ class FilterConfig(Settings):
     top_percent: float = Field(
         20.0, gt=0, le=100, description='percent of scored trajectories kept'
     )
-    top_k: int | None = Field(None, ge=1, description='number kept, instead of a percentage')
+    top_k: int | None = Field(None, ge=1, description='number kept, instead of top_percent')
     position_dims: tuple[int, ...] = Field(
         (0, 1), min_length=1, description='observation coordinates that distances use'
     )
@@ -33,7 +33,7 @@ class FilterConfig(Settings):
     min_steps: int = Field(
         10, ge=0, description='gcttt: fewest steps to the state of highest value'
     )
-    seed: int = Field(0, ge=0, description='of the trajectories drawn by the ablations')
+    seed: int = Field(0, ge=0, description='random seed of the ablations')
 
     @model_validator(mode='after')
     def _check_dims(self) -> Self:

@@ -1,4 +1,4 @@
-"""Rows of a dataset by where they are: a sorted grid over one or two coordinates."""
+"""Spatial index of dataset rows: a sorted grid over one or two coordinates."""
 
 from typing import NamedTuple
 
@@ -41,7 +41,7 @@ class SpatialIndex:
         planar = [column * factor for column, factor in zip(columns, self._scale, strict=False)]
         self._origin = np.array([values.min() for values in planar])
         self._extent = np.array([values.max() for values in planar])
-        # Far outliers must not make more cells than an integer can number.
+        # Far outliers must not create more cells than an integer can number.
         self._edges = np.maximum(self._cell_size, (self._extent - self._origin) / _MOST_CELLS)
         cells = [self._cell(values, axis) for axis, values in enumerate(planar)]
         self._stride = int(cells[1].max()) + 1 if len(cells) == 2 else 1
@@ -74,7 +74,7 @@ class SpatialIndex:
         return Neighbours(*(np.concatenate(arrays) for arrays in zip(*found, strict=True)))
 
     def _near(self, part: slice, point: np.ndarray, radius: float, strict: bool) -> Neighbours:
-        """Those of one run of sorted rows that are in the ball."""
+        """The rows of one run of sorted rows that lie in the ball."""
         distances = self._distances([column[part] for column in self._columns], point)
         rows = self._order[part]
         if len(self._dims) > 2:

@@ -1,4 +1,4 @@
-"""The support set: what the filter chose for one task, and why."""
+"""The support set: the transitions that the filter chose for one task."""
 
 from dataclasses import dataclass, replace
 
@@ -50,7 +50,7 @@ class SupportSet:
         return len(self.indices)
 
     def __eq__(self, other: object) -> bool:
-        """Whether everything but the time it took is the same."""
+        """Equality of everything but the query time."""
         if not isinstance(other, SupportSet):
             return NotImplemented
         return (
@@ -63,7 +63,7 @@ class SupportSet:
         )
 
     def without_rows(self, excluded: np.ndarray) -> 'SupportSet':
-        """The same support less the rows where `excluded` (N,) is true."""
+        """The same support without the rows where `excluded` (N,) is true."""
         return replace(self, indices=self.indices[~excluded[self.indices]])
 
     def split(
@@ -75,9 +75,9 @@ class SupportSet:
         """A random train split that adapts and a disjoint test split that scores the result.
 
         Args:
-            test_fraction: Share of the transitions held out, rounded, at least one.
+            test_fraction: Fraction of the transitions held out, rounded, at least one.
             max_test: The test split is thinned to this many transitions.
-            seed: Of the random choice.
+            seed: Random seed.
 
         Returns:
             (train, test), both with ascending indices; test is empty when there are fewer than two

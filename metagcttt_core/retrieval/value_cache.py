@@ -1,4 +1,4 @@
-"""V of dataset rows towards a goal, each evaluated once."""
+"""Cache of V(row | g), so that each dataset row is evaluated once per goal."""
 
 from collections import OrderedDict
 from collections.abc import Callable
@@ -27,7 +27,7 @@ class ValueCache:
         self._lock = threading.Lock()
 
     def values(self, value_fn: ValueFunction, goal: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """V of each row (n,), float32; only rows that are not known yet are evaluated.
+        """V of each row (n,), float32; only unknown rows are evaluated.
 
         Args:
             value_fn: (observations (n, obs_dim), goal (obs_dim,)) -> (n,).
@@ -50,12 +50,12 @@ class ValueCache:
         goal: np.ndarray,
         should_stop: Callable[[], bool] = lambda: False,
     ) -> bool:
-        """Evaluate V everywhere, so that every later query of this goal finds it known.
+        """Evaluate V on every row, so that later queries of this goal are fast.
 
-        Meant for a background thread; `should_stop` is asked between batches.
+        Meant for a background thread; `should_stop` is polled between batches.
 
         Returns:
-            Whether it was finished.
+            True if it finished.
         """
         goal = np.asarray(goal, np.float32)
         known = self._known(value_fn, goal)
@@ -67,7 +67,7 @@ class ValueCache:
         return True
 
     def _known(self, value_fn: ValueFunction, goal: np.ndarray) -> np.ndarray:
-        """The remembered values of a pair, NaN where not known; the oldest pair makes room."""
+        """The cached values of a pair, NaN where unknown; the oldest pair is evicted."""
         key = (value_fn, goal.tobytes())
         with self._lock:
             if key not in self._values:

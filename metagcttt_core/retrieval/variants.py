@@ -165,7 +165,7 @@ def smallest_per_episode(episodes: np.ndarray, rows: np.ndarray, values: np.ndar
 
 
 def _stops_after(task: Task, end: PerEpisode) -> np.ndarray:
-    """Where cuts stop that include their end, unless that is a last row."""
+    """Stops of cuts that include their end, unless that is a last row."""
     return np.minimum(end.rows + 1, task.dataset.episode_ends[end.episodes])
 
 
