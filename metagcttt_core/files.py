@@ -1,12 +1,19 @@
-"""Atomic file writes: a crash leaves the old content or the new, never a part."""
+"""Files and folders that are safe to write and to remove.
+
+Writes are atomic: a crash leaves the old content or the new, never a part. A folder is removed
+only if it carries our mark, so nothing that somebody else made is ever deleted.
+"""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 import json
 import os
 from pathlib import Path
+import shutil
 import tempfile
 from typing import Any, IO
+
+_MARK = '.made-by-metagcttt'
 
 
 @contextmanager
@@ -33,3 +40,33 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write JSON atomically, one key per line."""
     with atomic_write(path) as file:
         file.write((json.dumps(content, indent=2) + '\n').encode())
+
+
+def claim_folder(path: Path) -> None:
+    """Create a folder that carries our mark, or reopen one.
+
+    Raises:
+        FileExistsError: If `path` exists without the mark, or is a symbolic link.
+    """
+    if not os.path.lexists(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        marked = Path(tempfile.mkdtemp(dir=path.parent, prefix=f'.{path.name}.'))
+        marked.chmod(0o755)
+        (marked / _MARK).touch()
+        try:
+            marked.rename(path)
+        except OSError:  # somebody was faster
+            shutil.rmtree(marked)
+    if path.is_symlink() or not (path / _MARK).is_file():
+        raise FileExistsError(f'{path} exists and was not made by metagcttt: move it elsewhere')
+
+
+def remove_claimed(path: Path) -> None:
+    """Remove a folder that `claim_folder` made; one that does not exist is fine.
+
+    Raises:
+        FileExistsError: If it does not carry our mark, or is a symbolic link.
+    """
+    if os.path.lexists(path):
+        claim_folder(path)
+        shutil.rmtree(path)

@@ -6,10 +6,8 @@ from typing import Self
 
 import numpy as np
 
-from metagcttt_core.data import minari, npz
+from metagcttt_core.data import checks, minari, npz
 from metagcttt_core.data.errors import DatasetError
-
-_CHUNK_ROWS = 1 << 20
 
 
 class TrajectoryDataset:
@@ -81,9 +79,9 @@ class TrajectoryDataset:
                 last row that is not terminal.
         """
         where = str(source) if source else 'dataset'
-        observations = _matrix(observations, 'observations', where)
-        actions = _matrix(actions, 'actions', where)
-        terminals = _flags(terminals, where)
+        observations = checks.matrix(observations, 'observations', where)
+        actions = checks.matrix(actions, 'actions', where)
+        terminals = checks.flags(terminals, 'terminals', where)
         extras = {name: np.asanyarray(array) for name, array in (extras or {}).items()}
         rows = len(observations)
         if rows == 0:
@@ -102,12 +100,16 @@ class TrajectoryDataset:
                 'the last row of every trajectory must be terminal'
             )
         for name, array in {'observations': observations, 'actions': actions, **extras}.items():
-            _check_finite(array, name, where)
+            checks.finite(array, name, where)
+        checks.warn_of_oddities(observations, actions, terminals, where)
         return cls(observations, actions, terminals, extras, source)
 
     @classmethod
     def load(cls, path: str | Path, *, memory_map: bool | None = None) -> Self:
         """Read a dataset in OGBench's npz format, or a Minari dataset.
+
+        Trajectories end where `terminals` or another of `checks.END_MARKS` says so. Suspicious
+        content that can be used is logged: jumps, actions beyond -1 to 1, lost precision.
 
         Args:
             path: The `.npz` file. Its arrays `observations`, `actions` and `terminals` are
@@ -128,9 +130,13 @@ class TrajectoryDataset:
             arrays = npz.read_arrays(
                 path, required=('observations', 'actions', 'terminals'), memory_map=memory_map
             )
-        fields = {name: arrays.pop(name) for name in ('observations', 'actions', 'terminals')}
-        arrays.pop('next_observations', None)  # always the following row
-        return cls.from_arrays(**fields, extras=arrays, source=path)
+        ends = checks.take_ends(arrays, str(path))
+        observations, actions = arrays.pop('observations'), arrays.pop('actions')
+        following = arrays.pop('next_observations', None)
+        dataset = cls.from_arrays(observations, actions, ends, arrays, source=path)
+        if following is not None:
+            checks.following_rows(dataset.observations, following, ends, str(path))
+        return dataset
 
     def save(self, path: str | Path) -> None:
         """Write the dataset as OGBench's compressed npz, atomically; the inverse of `load`."""
@@ -199,52 +205,3 @@ class TrajectoryDataset:
             f'TrajectoryDataset({self.num_episodes} trajectories, {self.num_rows} rows, '
             f'obs_dim={self.obs_dim}, act_dim={self.act_dim})'
         )
-
-
-def _matrix(values: np.ndarray, name: str, where: str) -> np.ndarray:
-    array = np.asanyarray(values)
-    if array.dtype.kind not in 'fiu':
-        raise DatasetError(f'{where}: {name} must hold real numbers, got dtype {array.dtype}')
-    if array.ndim != 2 or array.shape[1] == 0:
-        raise DatasetError(
-            f'{where}: {name} must have shape (rows, dimensions), got {array.shape}'
-        )
-    if array.dtype == np.float32:
-        return array
-    # Checked before narrowing too: a finite double can become infinite in float32.
-    _check_finite(array, name, where)
-    with np.errstate(over='ignore'):
-        return array.astype(np.float32)
-
-
-def _flags(values: np.ndarray, where: str) -> np.ndarray:
-    array = np.asanyarray(values)
-    if array.ndim != 1:
-        raise DatasetError(f'{where}: terminals must have shape (rows,), got {array.shape}')
-    if array.dtype == np.bool_:
-        return array
-    if array.dtype.kind not in 'fiu':
-        raise DatasetError(
-            f'{where}: terminals must hold booleans or 0 and 1, got dtype {array.dtype}'
-        )
-    wrong = np.flatnonzero((array != 0) & (array != 1))
-    if len(wrong):
-        raise DatasetError(
-            f'{where}: terminals must hold 0 or 1, got {array[wrong[0]]} in row {wrong[0]}'
-        )
-    return array.astype(bool)
-
-
-def _check_finite(array: np.ndarray, name: str, where: str) -> None:
-    if array.dtype.kind != 'f':
-        return
-    for start in range(0, len(array), _CHUNK_ROWS):
-        finite = np.isfinite(array[start : start + _CHUNK_ROWS]).reshape(
-            len(array[start : start + _CHUNK_ROWS]), -1
-        )
-        if not finite.all():
-            row = int(np.flatnonzero(~finite.all(axis=1))[0])
-            value = array[start + row].reshape(-1)[~finite[row]][0]
-            raise DatasetError(
-                f'{where}: {name} is {value} in row {start + row}; every value must be finite'
-            )

@@ -9,6 +9,7 @@ from metagcttt_core.data.errors import DatasetError
 
 SUFFIXES = ('.hdf5', '.h5')
 _PER_ROW_INFOS = ('qpos', 'qvel')
+_MOST_EXPANSION = 1032  # of deflate
 
 
 def is_minari(path: Path) -> bool:
@@ -47,8 +48,12 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     file_path = _file_of(path)
     try:
         with h5py.File(file_path, 'r') as file:
-            return _join([_episode(file, name, file_path) for name in _episode_names(file)], path)
-    except OSError as error:
+            episodes = [_episode(file, name, file_path) for name in _episode_names(file, path)]
+            return _join(episodes, path)
+    except DatasetError:
+        raise
+    # HDF5 raises any of these for a damaged file, at whatever is read first.
+    except (OSError, RuntimeError, ValueError, LookupError, TypeError, MemoryError) as error:
         raise DatasetError(f'{file_path}: not a complete HDF5 file ({error})') from error
 
 
@@ -65,56 +70,77 @@ def _file_of(path: Path) -> Path:
     )
 
 
-def _episode_names(file: Any) -> list[str]:
-    names = [name for name in file if name.startswith('episode_') and name[8:].isdigit()]
-    return sorted(names, key=lambda name: int(name[8:]))
+def _episode_names(file: Any, path: Path) -> list[str]:
+    numbers = sorted(
+        int(name[8:]) for name in file if name.startswith('episode_') and name[8:].isdigit()
+    )
+    if missing := sorted(set(range(numbers[-1] if numbers else 0)) - set(numbers)):
+        raise DatasetError(f'{path}: episode {missing[0]} is missing of {numbers[-1] + 1}')
+    return [f'episode_{number}' for number in numbers]
 
 
 def _episode(file: Any, name: str, path: Path) -> dict[str, np.ndarray]:
-    group = file[name]
+    group = _member(file, name, path)
+    if not hasattr(group, 'keys'):
+        raise DatasetError(f'{path}: {name} must be a group, got an array')
     for required in ('observations', 'actions'):
         if required not in group:
             raise DatasetError(f'{path}: {name} has no {required}; found: {", ".join(group)}')
-    actions = _array(group['actions'], f'{name}/actions', path)
-    rows = {'observations': _observations(group['observations'], name, path)}
-    infos = group.get('infos', {})
-    for info in _PER_ROW_INFOS:
-        if info in infos:
-            rows[info] = _array(infos[info], f'{name}/infos/{info}', path)
+    actions = _array(group, 'actions', path)
+    observations = _observations(group, path)
     num_rows = len(actions) + 1
-    for field, values in rows.items():
-        if len(values) != num_rows:
-            raise DatasetError(
-                f'{path}: {name} has {len(actions)} actions but {len(values)} {field}, '
-                f'expected {num_rows}'
-            )
+    if len(observations) != num_rows:
+        raise DatasetError(
+            f'{path}: {name} has {len(actions)} actions but {len(observations)} observations, '
+            f'expected {num_rows}'
+        )
+    rows = {'observations': observations, **_infos(group, num_rows, path)}
     rows['actions'] = np.concatenate([actions, np.zeros_like(actions[:1])])
     rows['terminals'] = np.arange(num_rows) == num_rows - 1
     return rows
 
 
-def _observations(node: Any, name: str, path: Path) -> np.ndarray:
+def _infos(group: Any, num_rows: int, path: Path) -> dict[str, np.ndarray]:
+    """The states of the physics at each row, where they are; other infos are not looked at."""
+    infos = _member(group, 'infos', path) if 'infos' in group else {}
+    arrays = {name: _array(infos, name, path) for name in _PER_ROW_INFOS if name in infos}
+    return {name: array for name, array in arrays.items() if len(array) == num_rows}
+
+
+def _observations(group: Any, path: Path) -> np.ndarray:
+    node = _member(group, 'observations', path)
     if not hasattr(node, 'keys'):
-        return _array(node, f'{name}/observations', path)
+        return _array(group, 'observations', path)
     if 'observation' not in node or 'achieved_goal' not in node:
         raise DatasetError(
-            f'{path}: {name}/observations must hold observation and achieved_goal, '
+            f'{path}: {node.name[1:]} must hold observation and achieved_goal, '
             f'found: {", ".join(node)}'
         )
-    observation = _array(node['observation'], f'{name}/observations/observation', path)
-    achieved = _array(node['achieved_goal'], f'{name}/observations/achieved_goal', path)
-    if np.array_equal(observation[:, : achieved.shape[1]], achieved):
-        return observation
+    observation = _array(node, 'observation', path)
+    achieved = _array(node, 'achieved_goal', path)
     if len(observation) != len(achieved):
         raise DatasetError(
-            f'{path}: {name} has {len(observation)} observations '
+            f'{path}: {group.name[1:]} has {len(observation)} observations '
             f'but {len(achieved)} achieved goals'
         )
+    first = observation[:, : achieved.shape[1]]
+    if np.array_equal(first.astype(np.float32), achieved.astype(np.float32)):
+        return observation
     return np.concatenate([achieved, observation], axis=1)
 
 
-def _array(node: Any, name: str, path: Path) -> np.ndarray:
+def _member(group: Any, name: str, path: Path) -> Any:
+    """What a group holds under a name; links to other files or places are not followed."""
+    link = group.get(name, getlink=True)
+    if type(link).__name__ != 'HardLink':
+        raise DatasetError(f'{path}: {group.name}/{name} is a link, which is not followed')
+    return group[name]
+
+
+def _array(group: Any, name: str, path: Path) -> np.ndarray:
     """One stored array of shape (rows, numbers); anything else is refused."""
+    node = _member(group, name, path)
+    name = f'{group.name[1:]}/{name}'
     if (
         not hasattr(node, 'dtype')
         or node.dtype.kind not in 'fiu'
@@ -123,6 +149,8 @@ def _array(node: Any, name: str, path: Path) -> np.ndarray:
     ):
         got = f'{node.dtype} of shape {node.shape}' if hasattr(node, 'dtype') else 'a group'
         raise DatasetError(f'{path}: {name} must be numbers of shape (rows, numbers), got {got}')
+    if node.nbytes > _MOST_EXPANSION * path.stat().st_size:
+        raise DatasetError(f'{path}: {name} announces {node.nbytes} bytes, more than can be there')
     return np.asarray(node[()])
 
 

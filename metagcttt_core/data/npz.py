@@ -1,32 +1,51 @@
 """Reading and writing npz files of arrays, without ever unpickling."""
 
 from collections.abc import Mapping, Sequence
+import logging
+import math
 import os
 from pathlib import Path
 import shutil
 import tempfile
 from tokenize import TokenError
-from typing import IO
+from typing import IO, NamedTuple
 import zipfile
 import zlib
 
 import numpy as np
 
+from metagcttt_core.data.checks import looks_like_a_mark
 from metagcttt_core.data.errors import DatasetError
-from metagcttt_core.files import atomic_write
+from metagcttt_core.files import atomic_write, claim_folder
 
 MEMORY_MAP_BYTES = 2 << 30
 """Files that unpack to more than this many bytes are memory-mapped by default."""
+
+_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError)
+_BAD_HEADER = (ValueError, OverflowError, TokenError)
+_log = logging.getLogger(__name__)
+
+
+class _Member(NamedTuple):
+    """An array in the archive, known by its header alone."""
+
+    info: zipfile.ZipInfo
+    shape: tuple[int, ...]
+    dtype: np.dtype
 
 
 def read_arrays(
     path: Path, required: Sequence[str], memory_map: bool | None = None
 ) -> dict[str, np.ndarray]:
-    """Every array of an npz file by name.
+    """The arrays of rows in an npz file by name: those required, and others of equal length.
+
+    Whatever else the file holds is left out without being read: texts, single numbers, arrays of
+    other lengths, Python objects, files that are no arrays. Only what looks like a mark of
+    trajectories is never left out.
 
     Args:
         path: The file.
-        required: Names that must be there.
+        required: Names that must be there. The first decides the number of rows.
         memory_map: Map the arrays from disk instead of reading them; by default only large files.
             The archive is unpacked once into the folder `NAME.unpacked` beside it.
 
@@ -35,22 +54,13 @@ def read_arrays(
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            members = {info.filename.removesuffix('.npy'): info for info in archive.infolist()}
-            for name in members:
-                if Path(name).name != name:  # would escape the folder
-                    raise DatasetError(f'{path}: {name!r} is not a plain array name')
-            missing = [name for name in required if name not in members]
-            if missing:
-                raise DatasetError(
-                    f'{path}: missing {", ".join(missing)}; '
-                    f'required: {", ".join(required)}; found: {", ".join(members)}'
-                )
+            members = _chosen(path, archive, required)
             if memory_map is None:
-                memory_map = sum(info.file_size for info in members.values()) > MEMORY_MAP_BYTES
+                memory_map = sum(m.info.file_size for m in members.values()) > MEMORY_MAP_BYTES
             if memory_map:
                 folder = _unpack(path, archive, members)
                 return {name: _read(path, name, folder / f'{name}.npy') for name in members}
-            return {name: _read(path, name, archive.open(info)) for name, info in members.items()}
+            return {name: _read(path, name, archive.open(m.info)) for name, m in members.items()}
     except FileNotFoundError as error:
         raise DatasetError(f'{path}: no such file') from error
     except IsADirectoryError as error:
@@ -59,7 +69,7 @@ def read_arrays(
         raise
     except OSError as error:
         raise DatasetError(f'{path}: cannot be read or unpacked ({error})') from error
-    # What zipfile raises for damaged, encrypted or unknown archives, besides its own error.
+    # zipfile raises these for damaged, encrypted or unknown archives, besides its own error.
     except (zipfile.BadZipFile, RuntimeError, ValueError) as error:
         raise DatasetError(f'{path}: not a complete npz file ({error})') from error
 
@@ -70,6 +80,56 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
         np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
+def _chosen(path: Path, archive: zipfile.ZipFile, required: Sequence[str]) -> dict[str, _Member]:
+    """The members worth reading, by name of the array."""
+    infos = {i.filename[:-4]: i for i in archive.infolist() if i.filename.endswith('.npy')}
+    for name in infos:
+        if Path(name).name != name:  # would escape the folder
+            raise DatasetError(f'{path}: {name!r} is not a plain array name')
+    missing = [name for name in required if name not in infos]
+    if missing:
+        raise DatasetError(
+            f'{path}: missing {", ".join(missing)}; '
+            f'required: {", ".join(required)}; found: {", ".join(infos)}'
+        )
+    members = {name: _header(path, name, archive, info) for name, info in infos.items()}
+    rows = members[required[0]].shape[:1] if required else None
+    chosen = {
+        name: member
+        for name, member in members.items()
+        if name in required
+        or rows is None
+        or (member.shape[:1] == rows and member.dtype.kind in 'bfiu')
+        or (member.shape and looks_like_a_mark(name))
+    }
+    if left_out := sorted(members.keys() - chosen.keys()):
+        _log.info('%s: left out %s, which are no rows of numbers', path, ', '.join(left_out))
+    return chosen
+
+
+def _header(path: Path, name: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> _Member:
+    """Shape and type of an array, after checking that as many bytes follow as they need."""
+    try:
+        with archive.open(info) as file:
+            version = np.lib.format.read_magic(file)
+            if version == (1, 0):
+                shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+            else:
+                shape, _, dtype = np.lib.format.read_array_header_2_0(file)
+            num_bytes = info.file_size - file.tell()
+    except _DAMAGE as error:
+        raise DatasetError(f'{path}: {name} is truncated or damaged ({error})') from error
+    except (*_BAD_HEADER, MemoryError, RecursionError) as error:
+        raise DatasetError(
+            f'{path}: {name} cannot be read, it is pickled or damaged ({error})'
+        ) from error
+    if not dtype.hasobject and math.prod(shape) * dtype.itemsize != num_bytes:
+        raise DatasetError(
+            f'{path}: {name} is damaged: {dtype} of shape {shape} does not take {num_bytes} bytes'
+        )
+    return _Member(info, shape, dtype)
+
+
 def _read(path: Path, name: str, source: Path | IO[bytes]) -> np.ndarray:
     """One array: mapped when `source` is a path, read when it is an open member of the archive."""
     try:
@@ -77,32 +137,34 @@ def _read(path: Path, name: str, source: Path | IO[bytes]) -> np.ndarray:
             return np.load(source, mmap_mode='r', allow_pickle=False)
         with source:
             return np.lib.format.read_array(source, allow_pickle=False)
-    except (zipfile.BadZipFile, zlib.error, EOFError) as error:
+    except _DAMAGE as error:
         raise DatasetError(f'{path}: {name} is truncated or damaged ({error})') from error
     except MemoryError as error:
         raise DatasetError(f'{path}: {name} does not fit into memory ({error})') from error
-    except (ValueError, OverflowError, TokenError) as error:  # a bad header leads to any of these
+    except _BAD_HEADER as error:
         raise DatasetError(
             f'{path}: {name} cannot be read, it is pickled or damaged ({error})'
         ) from error
 
 
-def _unpack(path: Path, archive: zipfile.ZipFile, members: Mapping[str, zipfile.ZipInfo]) -> Path:
+def _unpack(path: Path, archive: zipfile.ZipFile, members: Mapping[str, _Member]) -> Path:
     """The archive's arrays as npy files beside it, renewed when the archive changed."""
     stat = path.stat()
-    folder = path.with_name(f'{path.stem}.unpacked') / f'{stat.st_size:x}-{stat.st_mtime_ns:x}'
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, info in members.items():
+    unpacked = path.with_name(f'{path.stem}.unpacked')
+    claim_folder(unpacked)
+    folder = unpacked / f'{stat.st_size:x}-{stat.st_mtime_ns:x}'
+    folder.mkdir(exist_ok=True)
+    for name, member in members.items():
         target = folder / f'{name}.npy'
-        if target.exists() and target.stat().st_size == info.file_size:
+        if target.exists() and target.stat().st_size == member.info.file_size:
             continue
         with tempfile.TemporaryDirectory(dir=folder) as scratch:
             try:
-                extracted = archive.extract(info, scratch)
-            except (zipfile.BadZipFile, zlib.error, EOFError) as error:
+                extracted = archive.extract(member.info, scratch)
+            except _DAMAGE as error:
                 raise DatasetError(f'{path}: {name} is truncated or damaged ({error})') from error
             os.replace(extracted, target)
-    for outdated in folder.parent.iterdir():
-        if outdated != folder:
+    for outdated in unpacked.iterdir():
+        if outdated.is_dir() and not outdated.is_symlink() and outdated != folder:
             shutil.rmtree(outdated)
     return folder

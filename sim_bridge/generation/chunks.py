@@ -3,11 +3,10 @@
 from dataclasses import dataclass
 import json
 from pathlib import Path
-import shutil
 from typing import Any
 import zipfile
 
-from metagcttt_core.files import atomic_write, write_json
+from metagcttt_core.files import atomic_write, claim_folder, remove_claimed, write_json
 import numpy as np
 
 from sim_bridge.generation.episodes import Episode
@@ -80,7 +79,10 @@ class ChunkFolder:
         if file.exists():
             refuse_difference(self.path, json.loads(file.read_text(encoding='utf-8')), settings)
             return
-        self.path.mkdir(parents=True, exist_ok=True)
+        try:
+            claim_folder(self.path)
+        except FileExistsError as error:
+            raise GenerationError(str(error)) from error
         write_json(file, settings)
 
     def exists(self) -> bool:
@@ -115,5 +117,12 @@ class ChunkFolder:
             raise GenerationError(f'{path} is damaged ({error}): remove it and resume') from error
 
     def remove(self) -> None:
-        """Delete the folder if it exists."""
-        shutil.rmtree(self.path, ignore_errors=True)
+        """Delete the folder if it exists.
+
+        Raises:
+            GenerationError: If it was not made by `open`.
+        """
+        try:
+            remove_claimed(self.path)
+        except FileExistsError as error:
+            raise GenerationError(str(error)) from error

@@ -120,7 +120,9 @@ def generate(
     settings = _settings(plan, follower)
     if overwrite:
         folder.remove()
-        paths.sidecar.unlink(missing_ok=True)
+        if paths.sidecar.exists():
+            _stored(paths.sidecar)  # or it is not ours to remove
+            paths.sidecar.unlink()
     elif not resume:
         _refuse_existing(paths)
     elif paths.sidecar.exists():
@@ -166,15 +168,20 @@ def _refuse_existing(paths: OutputPaths) -> None:
 
 def _finished(sidecar: Path, settings: dict[str, Any]) -> DatasetStatistics:
     """Statistics of a complete dataset, once its settings are verified."""
-    try:
-        stored = json.loads(sidecar.read_text(encoding='utf-8'))
-        statistics = DatasetStatistics(**stored.pop('statistics'))
-    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
-        raise GenerationError(
-            f'{sidecar} describes no generated dataset: overwrite it or choose another output'
-        ) from error
+    stored, statistics = _stored(sidecar)
     refuse_difference(sidecar, stored, settings)
     return statistics
+
+
+def _stored(sidecar: Path) -> tuple[dict[str, Any], DatasetStatistics]:
+    """Settings and statistics of a complete dataset."""
+    try:
+        stored = json.loads(sidecar.read_text(encoding='utf-8'))
+        return stored, DatasetStatistics(**stored.pop('statistics'))
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise GenerationError(
+            f'{sidecar} describes no generated dataset: move it or choose another output'
+        ) from error
 
 
 def _assemble(

@@ -2,7 +2,7 @@
 
 import json
 
-from metagcttt_core.files import atomic_write, write_json
+from metagcttt_core.files import atomic_write, claim_folder, remove_claimed, write_json
 import pytest
 
 
@@ -59,3 +59,30 @@ def test_json_that_cannot_be_written_leaves_the_old(tmp_path):
     with pytest.raises(TypeError):
         write_json(path, {'one': object()})
     assert json.loads(path.read_text())['two'] is None
+
+
+def test_claimed_folder_is_reopened_and_removed(tmp_path):
+    folder = tmp_path / 'a' / 'ours'
+    remove_claimed(folder)  # nothing there
+    for _ in range(2):
+        claim_folder(folder)
+        (folder / 'content').write_text('ours')
+    remove_claimed(folder)
+    assert list(folder.parent.iterdir()) == []
+
+
+def test_folder_of_somebody_else_is_neither_used_nor_removed(tmp_path):
+    theirs = tmp_path / 'theirs'
+    theirs.mkdir()
+    (theirs / 'thesis').write_text('four years of work')
+    claim_folder(tmp_path / 'ours')
+    link, file = tmp_path / 'link', tmp_path / 'file'
+    link.symlink_to(tmp_path / 'ours', target_is_directory=True)
+    file.write_text('theirs too')
+    for path in (theirs, link, file):
+        for touch in (claim_folder, remove_claimed):
+            with pytest.raises(FileExistsError, match=f'{path.name} exists and was not made by'):
+                touch(path)
+    assert (theirs / 'thesis').read_text() == 'four years of work'
+    assert file.read_text() == 'theirs too'
+    assert {path.name for path in tmp_path.iterdir()} == {'theirs', 'ours', 'link', 'file'}

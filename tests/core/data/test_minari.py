@@ -158,3 +158,80 @@ def test_without_h5py_the_message_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, 'h5py', None)
     with pytest.raises(DatasetError, match=r'pip install -c constraints\.txt h5py'):
         TrajectoryDataset.load(tmp_path / 'a.hdf5')
+
+
+def point_episode(file, number):
+    group = file.create_group(f'episode_{number}')
+    observations = group.create_group('observations')
+    observations['observation'] = np.random.default_rng(number).normal(size=(6, 4))
+    observations['achieved_goal'] = observations['observation'][:, :2]
+    group['actions'] = np.zeros((5, 2))
+    return group
+
+
+@pytest.fixture
+def two_episodes(tmp_path):
+    with h5py.File(tmp_path / 'main_data.hdf5', 'w') as file:
+        for number in range(2):
+            point_episode(file, number)
+        yield file
+
+
+def loaded(file):
+    path = file.filename
+    file.close()
+    return TrajectoryDataset.load(path)
+
+
+def test_achieved_goal_in_single_precision_is_found_in_the_observation(two_episodes):
+    for group in two_episodes.values():
+        positions = group['observations/achieved_goal'][()].astype(np.float32)
+        del group['observations/achieved_goal']
+        group['observations/achieved_goal'] = positions
+    assert loaded(two_episodes).obs_dim == 4
+
+
+def test_infos_that_nobody_needs_are_left_out(two_episodes):
+    for number in range(2):
+        infos = two_episodes[f'episode_{number}'].create_group('infos')
+        infos['qpos'] = np.zeros((5, 2))  # T rows, not T + 1
+        infos['success'] = np.zeros(5, bool)
+    dataset = loaded(two_episodes)
+    assert (dataset.num_episodes, dataset.extras) == (2, {})
+
+
+def external(file):
+    file['episode_2'] = h5py.ExternalLink('not-copied-along.hdf5', '/episode_0')
+
+
+def soft(file):
+    file['episode_2'] = h5py.SoftLink('/episode_0')
+
+
+def array(file):
+    file['episode_2'] = np.zeros(3)
+
+
+def gap(file):
+    point_episode(file, 3)
+
+
+def bomb(file):
+    del file['episode_1/actions']
+    file['episode_1'].create_dataset('actions', (10**12, 2), 'f8', chunks=(1000, 2))
+
+
+@pytest.mark.parametrize(
+    ('oddity', 'message'),
+    [
+        (external, 'episode_2 is a link, which is not followed'),
+        (soft, 'episode_2 is a link, which is not followed'),
+        (array, 'episode_2 must be a group, got an array'),
+        (gap, 'episode 2 is missing of 4'),
+        (bomb, 'episode_1/actions announces 16000000000000 bytes, more than can be there'),
+    ],
+)
+def test_odd_episode_is_refused_by_name(two_episodes, oddity, message):
+    oddity(two_episodes)
+    with pytest.raises(DatasetError, match=rf'main_data\.hdf5: .*{message}'):
+        loaded(two_episodes)

@@ -150,7 +150,8 @@ def test_resume_records_only_what_is_missing_and_gives_the_same_files(
 
 
 def contents_of_partial(output: Path) -> list[str]:
-    return [file.name for file in output.with_suffix('.partial').iterdir()]
+    names = {file.name for file in output.with_suffix('.partial').iterdir()}
+    return sorted(names - {'.made-by-metagcttt'})
 
 
 def test_unfinished_dataset_is_not_touched_without_being_told(unfinished: Path) -> None:
@@ -333,3 +334,19 @@ def test_end_in_the_middle_leaves_no_worker_and_resume_gives_the_same_files(
     (tmp_path / 'whole').mkdir()
     generate(asked, tmp_path / 'whole' / 'maze.npz')
     assert contents(output.parent) == contents(tmp_path / 'whole')
+
+
+def test_files_of_somebody_else_are_not_overwritten(tmp_path: Path) -> None:
+    output = tmp_path / 'maze.npz'
+    (tmp_path / 'maze.partial').mkdir()
+    (tmp_path / 'maze.partial' / 'thesis').write_text('four years of work')
+    for flags in ({}, {'resume': True}, {'overwrite': True}):
+        with pytest.raises(GenerationError, match=r'maze\.partial'):
+            generate(small(9), output, **flags)
+    assert (tmp_path / 'maze.partial' / 'thesis').exists()
+    (tmp_path / 'maze.json').write_text('{"mine": true}')
+    (tmp_path / 'maze.partial' / 'thesis').unlink()
+    (tmp_path / 'maze.partial').rmdir()
+    with pytest.raises(GenerationError, match=r'maze\.json describes no generated dataset'):
+        generate(small(9), output, overwrite=True)
+    assert (tmp_path / 'maze.json').read_text() == '{"mine": true}'

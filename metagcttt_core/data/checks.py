@@ -1,0 +1,198 @@
+"""Checks of what a dataset file says, before anything is trained on it."""
+
+from collections.abc import Iterator
+import logging
+import re
+
+import numpy as np
+
+from metagcttt_core.data.errors import DatasetError
+
+END_MARKS = (
+    'timeouts',
+    'truncations',
+    'truncated',
+    'terminations',
+    'terminated',
+    'dones',
+    'episode_ends',
+)
+"""Arrays that mark the last rows of trajectories, beside `terminals`."""
+
+_LIKE_A_MARK = re.compile(r'timeout|trunc|termin|done|episode|traj|first|last|start|end|reset')
+_CHUNK_ROWS = 1 << 20
+_JUMP = 30.0  # times the longest of ordinary steps
+_log = logging.getLogger(__name__)
+
+
+def matrix(values: np.ndarray, name: str, where: str) -> np.ndarray:
+    """`values` as float32 of shape (rows, dimensions).
+
+    Raises:
+        DatasetError: If they are no real numbers of that shape, or not finite.
+    """
+    array = np.asanyarray(values)
+    if array.dtype.kind not in 'fiu':
+        raise DatasetError(f'{where}: {name} must hold real numbers, got dtype {array.dtype}')
+    if array.ndim != 2 or array.shape[1] == 0:
+        raise DatasetError(
+            f'{where}: {name} must have shape (rows, dimensions), got {array.shape}'
+        )
+    if array.dtype == np.float32:
+        return array
+    # Checked before narrowing too: a finite double can become infinite in float32.
+    finite(array, name, where)
+    with np.errstate(over='ignore'):
+        narrowed = array.astype(np.float32)
+    _warn_of_lost_precision(array, narrowed, name, where)
+    return narrowed
+
+
+def flags(values: np.ndarray, name: str, where: str) -> np.ndarray:
+    """`values` as booleans of shape (rows,).
+
+    Raises:
+        DatasetError: If they are neither booleans nor zeros and ones of that shape.
+    """
+    array = np.asanyarray(values)
+    if array.ndim != 1:
+        raise DatasetError(f'{where}: {name} must have shape (rows,), got {array.shape}')
+    if array.dtype == np.bool_:
+        return array
+    if array.dtype.kind not in 'fiu':
+        raise DatasetError(
+            f'{where}: {name} must hold booleans or 0 and 1, got dtype {array.dtype}'
+        )
+    wrong = np.flatnonzero((array != 0) & (array != 1))
+    if len(wrong):
+        raise DatasetError(
+            f'{where}: {name} must hold 0 or 1, got {array[wrong[0]]} in row {wrong[0]}'
+        )
+    return array.astype(bool)
+
+
+def finite(array: np.ndarray, name: str, where: str) -> None:
+    """Refuse numbers that are not finite.
+
+    Raises:
+        DatasetError: With the row of the first.
+    """
+    if array.dtype.kind != 'f':
+        return
+    for start, part in _chunks(array):
+        good = np.isfinite(part).reshape(len(part), -1)
+        if not good.all():
+            row = int(np.flatnonzero(~good.all(axis=1))[0])
+            value = part[row].reshape(-1)[~good[row]][0]
+            raise DatasetError(
+                f'{where}: {name} is {value} in row {start + row}; every value must be finite'
+            )
+
+
+def looks_like_a_mark(name: str) -> bool:
+    """True if an array of that name may say where trajectories begin or end."""
+    return bool(_LIKE_A_MARK.search(name.lower()))
+
+
+def take_ends(arrays: dict[str, np.ndarray], where: str) -> np.ndarray:
+    """The rows that end a trajectory, by `terminals` and all `END_MARKS`, which are taken out.
+
+    Raises:
+        DatasetError: If a mark is no flag for each row, or another array looks like a mark.
+    """
+    ends = flags(arrays.pop('terminals'), 'terminals', where)
+    for name in [name for name in END_MARKS if name in arrays]:
+        mark = flags(arrays.pop(name), name, where)
+        if len(mark) != len(ends):
+            raise DatasetError(
+                f'{where}: {name} has {len(mark)} rows but terminals has {len(ends)}'
+            )
+        ends = ends | mark
+    for name in arrays:
+        if looks_like_a_mark(name):
+            raise DatasetError(
+                f'{where}: {name} looks like a mark of trajectories and is not understood: remove '
+                f'it, or give it one of the names {", ".join(END_MARKS)} (true on last rows)'
+            )
+    return ends
+
+
+def following_rows(
+    observations: np.ndarray, following: np.ndarray, ends: np.ndarray, where: str
+) -> None:
+    """Refuse `next_observations` that are not the observations of the next row.
+
+    Raises:
+        DatasetError: With the first row of a transition that leads somewhere else.
+    """
+    if following.shape != observations.shape:
+        raise DatasetError(
+            f'{where}: next_observations has shape {following.shape}, observations has '
+            f'{observations.shape}; they must match'
+        )
+    for start, part in _chunks(following[:-1]):
+        stop = start + len(part)
+        same = np.isclose(part, observations[start + 1 : stop + 1], rtol=1e-4, atol=1e-6)
+        wrong = np.flatnonzero(~same.all(axis=1) & ~ends[start:stop])
+        if len(wrong):
+            row = start + int(wrong[0])
+            raise DatasetError(
+                f'{where}: next_observations of row {row} is not observation {row + 1}, and no '
+                'trajectory ends there: store rows in the order of time'
+            )
+
+
+def warn_of_oddities(
+    observations: np.ndarray, actions: np.ndarray, ends: np.ndarray, where: str
+) -> None:
+    """Log what can be trained on but is probably a mistake: large actions, and jumps."""
+    largest = max(float(np.abs(part).max()) for _, part in _chunks(actions))
+    if largest > 1 + 1e-4:
+        _log.warning(
+            '%s: actions reach %.3g, beyond the range of a policy, which is -1 to 1: scale them',
+            where,
+            largest,
+        )
+    longest, row, ordinary = 0.0, 0, 0.0
+    for start, part in _chunks(observations):
+        inside = ~ends[start : start + len(part) - 1]
+        steps = np.abs(np.diff(part[:, :2], axis=0)).max(axis=1) * inside
+        if len(steps) and steps.max() > longest:
+            longest, row = float(steps.max()), start + int(steps.argmax())
+        if inside.any():
+            ordinary = max(ordinary, float(np.quantile(steps[inside], 0.99, method='lower')))
+    if ordinary and longest > _JUMP * ordinary:
+        _log.warning(
+            '%s: from row %d to the next the first two numbers jump by %.3g, where 99 %% of the '
+            'steps are below %.3g: does a trajectory end there?',
+            where,
+            row,
+            longest,
+            ordinary,
+        )
+
+
+def _warn_of_lost_precision(
+    exact: np.ndarray, narrowed: np.ndarray, name: str, where: str
+) -> None:
+    """Log numbers so far from zero that float32 rounds their changes away, such as UTM metres."""
+    if exact.dtype != np.float64 or len(exact) < 2:
+        return
+    part = slice(0, _CHUNK_ROWS)
+    lost = np.abs(exact[part] - narrowed[part]).max(axis=0)
+    steps = np.median(np.abs(np.diff(exact[part], axis=0)), axis=0)
+    for dim in np.flatnonzero((lost > 0.05 * steps) & (steps > 0)):
+        _log.warning(
+            '%s: %s[:, %d] loses %.2g in float32, where a step is %.2g: subtract an origin',
+            where,
+            name,
+            dim,
+            lost[dim],
+            steps[dim],
+        )
+
+
+def _chunks(array: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """First row and content of parts small enough to be looked at in memory."""
+    for start in range(0, len(array), _CHUNK_ROWS):
+        yield start, array[start : start + _CHUNK_ROWS]

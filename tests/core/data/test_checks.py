@@ -1,0 +1,115 @@
+"""What a file says about its trajectories is used or refused; what looks wrong is logged."""
+
+import logging
+
+from metagcttt_core import DatasetError, TrajectoryDataset
+from metagcttt_core.data.checks import END_MARKS
+import numpy as np
+import pytest
+
+
+def walk(rows=60, seed=0, start=0.0):
+    """A bounded random walk and its actions."""
+    actions = np.random.default_rng(seed).uniform(-1, 1, (rows, 2)).astype(np.float32)
+    steps = np.vstack([np.full((1, 2), start, np.float32), 0.2 * actions[:-1]])
+    return {'observations': steps.cumsum(axis=0), 'actions': actions}
+
+
+def two_walks():
+    """Observations of walks from different places, one behind the other."""
+    return np.vstack([walk(30)['observations'], walk(30, start=9)['observations']])
+
+
+def flags(*rows, total=60):
+    return np.isin(np.arange(total), rows)
+
+
+def saved(tmp_path, **arrays):
+    path = tmp_path / 'data.npz'
+    np.savez(path, **{**walk(), 'terminals': flags(59), **arrays})
+    return path
+
+
+@pytest.mark.parametrize('name', END_MARKS)
+@pytest.mark.parametrize('dtype', [bool, np.float32, np.int64])
+def test_trajectories_end_at_every_mark(tmp_path, name, dtype):
+    dataset = TrajectoryDataset.load(saved(tmp_path, **{name: flags(9, 29).astype(dtype)}))
+    assert dataset.episode_ends.tolist() == [9, 29, 59]
+    assert name not in dataset.extras
+
+
+@pytest.mark.parametrize(
+    ('name', 'array'),
+    [
+        ('is_first', flags(0, 30)),
+        ('episode_id', np.arange(60) // 30),
+        ('episode_starts', np.array([0, 30])),
+        ('traj_lengths', np.array([30, 30])),
+    ],
+)
+def test_unknown_mark_is_refused_by_name(tmp_path, name, array):
+    with pytest.raises(DatasetError, match=rf'data\.npz: {name} looks like a mark of trajector'):
+        TrajectoryDataset.load(saved(tmp_path, **{name: array}))
+
+
+def test_what_is_no_row_of_numbers_is_left_out(tmp_path):
+    path = saved(
+        tmp_path,
+        num_episodes=np.array(1),
+        env_name=np.array('maze'),
+        metadata=np.arange(3),
+        names=np.array(['a'] * 60),
+        qpos=np.zeros((60, 3)),
+    )
+    assert set(TrajectoryDataset.load(path).extras) == {'qpos'}
+
+
+def test_next_observations_in_the_order_of_rows_are_left_out(tmp_path):
+    observations = walk()['observations']
+    following = np.vstack([observations[1:], observations[:1]])
+    following[29] = 7.0  # the end of a trajectory may lead anywhere
+    path = saved(tmp_path, next_observations=following, timeouts=flags(29))
+    assert TrajectoryDataset.load(path).extras == {}
+
+
+def test_next_observations_in_another_order_are_refused(tmp_path):
+    order = np.random.default_rng(1).permutation(60)
+    rows = walk()
+    following = np.vstack([rows['observations'][1:], rows['observations'][-1:]])
+    shuffled = {name: array[order] for name, array in rows.items()}
+    path = saved(tmp_path, **shuffled, next_observations=following[order])
+    with pytest.raises(DatasetError, match='next_observations of row 0 is not observation 1'):
+        TrajectoryDataset.load(path)
+    path = saved(tmp_path, next_observations=following[:, :1])
+    with pytest.raises(DatasetError, match=r'next_observations has shape \(60, 1\)'):
+        TrajectoryDataset.load(path)
+
+
+@pytest.mark.parametrize(
+    ('arrays', 'told'),
+    [
+        ({'actions': 3 * walk()['actions']}, ['actions reach 2.9', 'scale them']),
+        (
+            {'observations': two_walks()},
+            ['from row 29 to the next', 'jump by'],
+        ),
+        (
+            {'observations': walk()['observations'].astype(np.float64) * 0.05 + (4e5, 0)},
+            ['observations[:, 0] loses', 'subtract an origin'],
+        ),
+    ],
+    ids=['actions', 'jump', 'precision'],
+)
+def test_suspicious_content_is_logged(tmp_path, arrays, told, caplog):
+    with caplog.at_level(logging.WARNING):
+        TrajectoryDataset.load(saved(tmp_path, **arrays))
+    (line,) = [record.getMessage() for record in caplog.records]
+    assert str(tmp_path / 'data.npz') in line
+    assert all(part in line for part in told), line
+
+
+def test_ordinary_content_is_not_remarked_upon(tmp_path, caplog):
+    with caplog.at_level(logging.WARNING):
+        TrajectoryDataset.load(saved(tmp_path, timeouts=flags(29)))
+        TrajectoryDataset.load(saved(tmp_path, timeouts=flags(29), observations=two_walks()))
+    assert caplog.records == []
