@@ -172,6 +172,15 @@ class MazeMap:
                 best = neighbour
         return best
 
+    def waypoint(self, start: Cell, goal: tuple[float, float]) -> tuple[float, float]:
+        """Point (x, y) to head for in `start`: the next cell's centre, or the goal in its cell.
+
+        Raises:
+            ValueError: If the goal lies outside the maze.
+        """
+        target = self.cell(*goal)
+        return goal if start == target else self.center(*self.next_cell(start, target))
+
     def _search(self, target: Cell) -> NDArray[np.int64]:
         table = np.full(self.walls.shape, -1, dtype=np.int64)
         table[target] = 0

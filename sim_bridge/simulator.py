@@ -121,6 +121,8 @@ class Simulator(ABC):
     ) -> Array:
         """Start an episode without a task, which never ends, and return its first observation.
 
+        A humanoid stands on its feet, unlike in OGBench, which drops it in a random pose.
+
         `step` reports neither `terminated` nor `truncated` in it. There is no goal until
         `set_goal` gives one; from then on `success` tells whether the robot is at it.
 

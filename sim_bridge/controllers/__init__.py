@@ -8,12 +8,14 @@ from sim_bridge.controllers.follower import (
     PointFollower,
     VelocityFollower,
 )
+from sim_bridge.controllers.humanoid import HumanoidFollower
 from sim_bridge.controllers.learned import LearnedFollower
 
 __all__ = [
     'AntFollower',
     'ControllerError',
     'DirectionFollower',
+    'HumanoidFollower',
     'LearnedFollower',
     'PointFollower',
     'VelocityFollower',

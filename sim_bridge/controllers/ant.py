@@ -21,7 +21,7 @@ class AntFollower(LearnedFollower):
     equally well along the whole compass.
     """
 
-    def act(self, observation: Array, direction: Array) -> Array:
+    def act(self, observation: Array, direction: Array, qpos: Array) -> Array:
         """Action for an observation of shape (29,) that moves along `direction`."""
         angle = math.atan2(direction[1], direction[0]) - _SECTOR_START_RAD
         turns = math.floor(angle / (math.pi / 2)) % 4

@@ -10,6 +10,7 @@ from sim_bridge.controllers.follower import (
     PointFollower,
     VelocityFollower,
 )
+from sim_bridge.controllers.humanoid import HumanoidFollower
 from sim_bridge.controllers.learned import LearnedFollower
 from sim_bridge.simulator import SimulatorSpec
 
@@ -20,6 +21,11 @@ _UNLEARNED: dict[str, type[DirectionFollower]] = {
     'pointmaze': PointFollower,
     'PointMaze': VelocityFollower,
 }
+_OWN_FOLLOWERS: dict[str, type[LearnedFollower]] = {
+    'ant': AntFollower,
+    'humanoid': HumanoidFollower,
+}
+_PROGRAMS = {'ant': 'train', 'humanoid': 'train-humanoid'}
 _LEARNED = {'antmaze': 'ant', 'humanoidmaze': 'humanoid'}
 
 
@@ -30,7 +36,7 @@ def make_direction_follower(
 
     Args:
         spec: The simulator whose robot it shall drive.
-        controller: Folder of a learned controller, as `metagcttt controller train` writes it; by
+        controller: Folder of a learned controller, as `tools.train_controller` writes it; by
             default the one that comes with the package, if the robot needs one.
 
     Raises:
@@ -60,7 +66,8 @@ def load_follower(folder: Path) -> LearnedFollower:
         ControllerError: If there is none or it is damaged.
     """
     follower = LearnedFollower.load(folder)
-    return AntFollower.load(folder) if follower.robot == 'ant' else follower
+    own = _OWN_FOLLOWERS.get(follower.robot)
+    return own.load(folder) if own else follower
 
 
 def _learned(spec: SimulatorSpec, robot: str, folder: Path | None) -> LearnedFollower:
@@ -69,7 +76,7 @@ def _learned(spec: SimulatorSpec, robot: str, folder: Path | None) -> LearnedFol
         raise ControllerError(
             f'{spec.name}: walking takes a learned direction controller ({spec.obs_dim} '
             f'observation and {spec.act_dim} action dimensions), and none comes with this '
-            f'package for {robot}: train one (metagcttt controller train --robot {robot}) '
+            f'package for {robot}: train one (metagcttt controller {_PROGRAMS[robot]}) '
             "and name its folder as the controller, or use OGBench's published datasets, which "
             'load as they are'
         )

@@ -12,12 +12,14 @@ class ControllerError(ValueError):
 class DirectionFollower(Protocol):
     """Drives a robot along a direction, without looking at the maze."""
 
-    def act(self, observation: Array, direction: Array) -> Array:
+    def act(self, observation: Array, direction: Array, qpos: Array) -> Array:
         """Action that moves the robot along `direction`.
 
         Args:
             observation: Shape (obs_dim,).
             direction: Unit vector (x, y) in the frame of the maze.
+            qpos: Generalised positions of the simulator: a humanoid's observation lacks its
+                heading.
 
         Returns:
             Action of shape (act_dim,), before any noise.
@@ -27,7 +29,7 @@ class DirectionFollower(Protocol):
 class PointFollower:
     """Follows a direction with the point, whose action is the direction it moves in."""
 
-    def act(self, observation: Array, direction: Array) -> Array:
+    def act(self, observation: Array, direction: Array, qpos: Array) -> Array:
         """Return the direction itself."""
         return direction
 
@@ -43,6 +45,6 @@ class VelocityFollower:
     GAIN = 1.0
     """Action per metre per second that is lacking."""
 
-    def act(self, observation: Array, direction: Array) -> Array:
+    def act(self, observation: Array, direction: Array, qpos: Array) -> Array:
         """Push towards the wanted velocity; an action may lie beyond -1 to 1, to be cut."""
         return self.GAIN * (self.SPEED_M_S * direction - observation[2:4])

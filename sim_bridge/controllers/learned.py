@@ -25,6 +25,7 @@ class _Index(BaseModel):
     version: Literal[1] = 1
     robot: str
     layers: int = Field(ge=1)
+    layer_norm: bool = False
     sha256: str = Field(pattern=r'^[0-9a-f]{64}$')
     metadata: dict[str, Any]
 
@@ -46,12 +47,14 @@ class LearnedFollower:
         weights: Of each layer, shape (fan in, fan out), float32.
         biases: Of each layer, shape (fan out,), float32.
         metadata: How it was trained.
+        layer_norm: Each hidden layer is normalised before its ReLU, without scale and offset.
     """
 
     robot: str
     weights: tuple[np.ndarray, ...]
     biases: tuple[np.ndarray, ...]
     metadata: dict[str, Any] = field(default_factory=dict)
+    layer_norm: bool = False
 
     def __post_init__(self) -> None:
         """Refuse layers that do not fit together.
@@ -72,9 +75,14 @@ class LearnedFollower:
                     )
 
     @property
+    def input_dim(self) -> int:
+        """Numbers that the network takes."""
+        return len(self.weights[0])
+
+    @property
     def obs_dim(self) -> int:
         """Numbers in an observation of the robot, x and y included."""
-        return len(self.weights[0])  # without x and y, but with the direction
+        return self.input_dim  # without x and y, but with the direction
 
     @property
     def act_dim(self) -> int:
@@ -86,15 +94,16 @@ class LearnedFollower:
         """Hash of the weights: tells which controller made a dataset."""
         return hashlib.sha256(self._serialized()).hexdigest()
 
-    def act(self, observation: Array, direction: Array) -> Array:
+    def act(self, observation: Array, direction: Array, qpos: Array) -> Array:
         """Action for an observation of shape (obs_dim,) that moves along `direction`."""
         return self.network(np.concatenate([observation[2:], direction]))
 
     def network(self, inputs: Array) -> Array:
-        """Action for the robot's own state and the direction, shape (obs_dim,)."""
+        """Actions, shape (..., act_dim), for inputs of shape (..., input_dim)."""
         x = inputs.astype(np.float32)
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            x = np.maximum(x @ weight + bias, 0)
+            x = x @ weight + bias
+            x = np.maximum(_normalized(x) if self.layer_norm else x, 0)
         return np.tanh(x @ self.weights[-1] + self.biases[-1]).astype(np.float64)
 
     def save(self, folder: Path) -> None:
@@ -107,6 +116,7 @@ class LearnedFollower:
         index = _Index(
             robot=self.robot,
             layers=len(self.weights),
+            layer_norm=self.layer_norm,
             sha256=self.sha256,
             metadata=self.metadata,
         )
@@ -133,6 +143,7 @@ class LearnedFollower:
                 weights=tuple(tensors[f'weight{i}'] for i in layers),
                 biases=tuple(tensors[f'bias{i}'] for i in layers),
                 metadata=index.metadata,
+                layer_norm=index.layer_norm,
             )
         except OSError as error:
             raise ControllerError(f'{folder}: no direction controller there ({error})') from error
@@ -146,3 +157,9 @@ class LearnedFollower:
         tensors = {f'weight{i}': weight for i, weight in enumerate(self.weights)}
         tensors |= {f'bias{i}': bias for i, bias in enumerate(self.biases)}
         return safetensors.numpy.save(tensors)
+
+
+def _normalized(x: np.ndarray) -> np.ndarray:
+    """Zero mean and unit variance along the last axis, as PyTorch's `layer_norm`."""
+    centered = x - x.mean(axis=-1, keepdims=True)
+    return centered / np.sqrt(np.square(centered).mean(axis=-1, keepdims=True) + 1e-5)

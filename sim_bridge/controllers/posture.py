@@ -5,6 +5,11 @@ from numpy.typing import NDArray
 
 FALLEN_COSINE = 0.25
 """A robot has fallen when its torso leans further than this cosine from the vertical."""
+FALLEN_HEAD_M = 0.9
+"""A humanoid has fallen when its head is lower; when it stands, that is at 1.4 to 1.5 m."""
+_HUMANOID_NQ = 28
+_NECK_M = 0.19
+"""From the humanoid's torso up to its head, which has no joint of its own."""
 
 
 def uprightness(qpos: np.ndarray) -> NDArray[np.float64]:
@@ -18,12 +23,19 @@ def uprightness(qpos: np.ndarray) -> NDArray[np.float64]:
     return 1 - 2 * (x**2 + y**2)
 
 
-def count_falls(qpos: np.ndarray) -> int:
-    """How often a robot fell in one episode, by its positions of shape (T, nq) in order.
+def has_fallen(qpos: np.ndarray) -> NDArray[np.bool_]:
+    """True where a robot leans too far or, a humanoid, has its head too low, shape (...).
 
     A robot without a free joint, such as the point, cannot fall.
     """
     if qpos.shape[-1] < 7:
-        return 0
-    fallen = uprightness(qpos) < FALLEN_COSINE
+        return np.zeros(qpos.shape[:-1], bool)
+    if qpos.shape[-1] == _HUMANOID_NQ:
+        return qpos[..., 2] + _NECK_M * uprightness(qpos) < FALLEN_HEAD_M
+    return uprightness(qpos) < FALLEN_COSINE
+
+
+def count_falls(qpos: np.ndarray) -> int:
+    """How often a robot fell in one episode, by its positions of shape (T, nq) in order."""
+    fallen = has_fallen(qpos)
     return int(fallen[0]) + int((fallen[1:] & ~fallen[:-1]).sum())

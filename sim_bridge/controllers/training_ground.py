@@ -1,14 +1,12 @@
-"""Where direction followers learn: OGBench's robots on an open floor."""
+"""Where the ant learns to follow a direction: on an open floor."""
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from sim_bridge.opengl import choose_opengl_library
 from sim_bridge.simulator import Array
-
-Robot = Literal['ant', 'humanoid']
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,7 +15,7 @@ class TrackStep:
 
     Attributes:
         observation: The robot's own state without x and y, then the direction as (x, y).
-        reward: For the ant the displacement along the direction, in metres.
+        reward: Displacement along the direction, in metres.
         fallen: The robot fell and the episode is over.
         over: The episode is over, by a fall or by its step limit.
     """
@@ -29,24 +27,16 @@ class TrackStep:
 
 
 class TrainingGround:
-    """OGBench's training environment for a robot: a floor and a direction that changes.
+    """OGBench's training environment for the ant: the direction is redrawn every 100 steps."""
 
-    The direction is redrawn every 100 steps (humanoid: 200).
-    """
-
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self) -> None:
         """Load the physics."""
         choose_opengl_library()
         import gymnasium
-        from ogbench.online_locomotion.wrappers import DMCHumanoidXYWrapper, GymXYWrapper
+        from ogbench.online_locomotion.wrappers import GymXYWrapper
 
-        environment = gymnasium.make(f'online-{robot}-v0', disable_env_checker=True)
-        self._env: Any = (
-            DMCHumanoidXYWrapper(environment, resample_interval=200)
-            if robot == 'humanoid'
-            else GymXYWrapper(environment, resample_interval=100)
-        )
-        self.robot = robot
+        environment = gymnasium.make('online-ant-v0', disable_env_checker=True)
+        self._env: Any = GymXYWrapper(environment, resample_interval=100)
         self.obs_dim = int(self._env.observation_space.shape[0])
         self.act_dim = int(self._env.action_space.shape[0])
 

@@ -1,66 +1,159 @@
-"""Walks of a learned controller on an open floor, to see how well it follows directions."""
+"""Walks of a learned controller on an open floor and through mazes, to see how good it is."""
 
 from dataclasses import dataclass
+import math
 from typing import Any
 
 import numpy as np
 
 from sim_bridge.controllers.learned import LearnedFollower
-from sim_bridge.controllers.posture import count_falls
-from sim_bridge.opengl import choose_opengl_library
+from sim_bridge.controllers.posture import count_falls, has_fallen
+from sim_bridge.mazes.ogbench import OGBenchMaze, open_floor, standing_pose
+from sim_bridge.simulator import Array
+
+TURN_EVERY_S = 2.5
+QUARTER_TURNS_RAD = (0.0, math.pi / 2, -math.pi / 2)
 
 
 @dataclass(frozen=True)
 class Walk:
-    """One walk along one direction.
+    """One walk along given directions.
 
     Attributes:
-        direction: Unit vector (x, y).
-        path: Positions (x, y) from the first to the last, shape (T + 1, 2), metres.
+        directions: Unit vectors (x, y), one a control step, shape (T, 2).
+        qpos: Generalised positions from the first to the last, shape (T + 1, nq).
         falls: How often the robot fell.
         period_s: Seconds per control step.
     """
 
-    direction: np.ndarray
-    path: np.ndarray
+    directions: Array
+    qpos: Array
     falls: int
     period_s: float
 
     @property
+    def direction(self) -> Array:
+        """The first direction."""
+        return self.directions[0]
+
+    @property
+    def path(self) -> Array:
+        """Positions (x, y), metres, shape (T + 1, 2)."""
+        return self.qpos[:, :2]
+
+    @property
+    def duration_s(self) -> float:
+        """Simulated seconds."""
+        return self.period_s * len(self.directions)
+
+    @property
     def distance_m(self) -> float:
-        """Metres along the direction."""
-        return float((self.path[-1] - self.path[0]) @ self.direction)
+        """Metres along the directions."""
+        return float((np.diff(self.path, axis=0) * self.directions).sum())
 
     @property
     def drift_m(self) -> float:
-        """Metres to the left of the direction."""
-        x, y = self.direction
-        return float((self.path[-1] - self.path[0]) @ (-y, x))
+        """Metres to the left of the directions."""
+        left = np.stack([-self.directions[:, 1], self.directions[:, 0]], axis=-1)
+        return float((np.diff(self.path, axis=0) * left).sum())
 
     @property
     def speed(self) -> float:
-        """Mean speed along the direction, metres per second."""
-        return self.distance_m / (self.period_s * (len(self.path) - 1))
+        """Mean speed along the directions, metres per second."""
+        return self.distance_m / self.duration_s
 
 
 def walk_along(
-    follower: LearnedFollower, direction: np.ndarray, duration_s: float, seed: int
+    follower: LearnedFollower,
+    direction: Array,
+    duration_s: float,
+    seed: int,
+    turns_rad: tuple[float, ...] = (),
+    action_noise: float = 0.0,
 ) -> Walk:
-    """Walk along a fixed direction from a random start pose; a fall does not end the walk."""
-    choose_opengl_library()
-    import gymnasium
-    import ogbench.online_locomotion  # registers the environments  # noqa: F401
+    """Walk on an open floor from a random start pose; a fall does not end the walk.
 
-    environment: Any = gymnasium.make(
-        f'online-{follower.robot}-v0', disable_env_checker=True
-    ).unwrapped
-    state, _ = environment.reset(seed=seed)
-    qpos = [environment.data.qpos.copy()]
-    for _ in range(round(duration_s / environment.dt)):
-        # The controller leaves out x and y, which this environment does not tell.
-        observation = np.concatenate([qpos[-1][:2], state])
-        state, *_ = environment.step(follower.act(observation, direction))
+    A fallen humanoid is put on its feet where it lies, as it cannot get up.
+
+    Args:
+        follower: The controller.
+        direction: Unit vector (x, y) to start along.
+        duration_s: Simulated seconds.
+        seed: Random seed of the poses, the turns and the noise.
+        turns_rad: Every `TURN_EVERY_S` the direction turns by one of these angles, drawn at
+            random; none keeps it.
+        action_noise: Standard deviation of what is added to the actions.
+    """
+    environment = open_floor(follower.robot)
+    environment.reset(seed=seed)
+    rng = np.random.default_rng(seed)
+    is_humanoid = follower.robot == 'humanoid'
+    if is_humanoid:
+        _stand_up(environment, rng)
+    turn_steps = round(TURN_EVERY_S / environment.dt)
+    qpos, directions, falls = [environment.data.qpos.copy()], [], 0
+    for step in range(round(duration_s / environment.dt)):
+        if turns_rad and step > 0 and step % turn_steps == 0:
+            direction = turned(direction, rng.choice(turns_rad))
+        action = follower.act(environment.get_ob(), direction, qpos[-1])
+        if action_noise > 0:
+            action = (action + rng.normal(0.0, action_noise, action.shape)).clip(-1, 1)
+        environment.do_simulation(action, environment.frame_skip)
+        if is_humanoid and has_fallen(environment.data.qpos):
+            falls += 1
+            _stand_up(environment, rng)
+        directions.append(direction)
         qpos.append(environment.data.qpos.copy())
     environment.close()
     positions = np.array(qpos)
-    return Walk(direction, positions[:, :2], count_falls(positions), environment.dt)
+    falls = falls if is_humanoid else count_falls(positions)
+    return Walk(np.array(directions), positions, falls, environment.dt)
+
+
+@dataclass(frozen=True)
+class GoalRun:
+    """One task of a maze, walked until the goal, a fall or the step limit.
+
+    Attributes:
+        reached: The goal was reached.
+        fallen: The robot fell on the way.
+        duration_s: Simulated seconds.
+    """
+
+    reached: bool
+    fallen: bool
+    duration_s: float
+
+
+def walk_to_goal(
+    follower: LearnedFollower, maze: OGBenchMaze, task_id: int, seed: int, action_noise: float
+) -> GoalRun:
+    """Walk a task along the shortest way through the cells, starting upright."""
+    _, goal = maze.reset(task_id, seed)
+    goal_xy = float(goal[0]), float(goal[1])
+    observation = maze.stand()
+    rng = np.random.default_rng(seed)
+    steps = 0
+    while True:
+        target = maze.maze.waypoint(maze.maze.cell(*maze.position), goal_xy)
+        offset = np.subtract(target, maze.position)
+        action = follower.act(observation, offset / np.linalg.norm(offset), maze.qpos)
+        result = maze.step(action + rng.normal(0.0, action_noise, action.shape))
+        observation = result.observation
+        steps += 1
+        fallen = bool(has_fallen(maze.qpos)) and not result.terminated
+        if result.terminated or result.truncated or fallen:
+            return GoalRun(result.terminated, fallen, steps * maze.spec.control_period_s)
+
+
+def _stand_up(environment: Any, rng: np.random.Generator) -> None:
+    x, y = environment.data.qpos[:2]
+    qpos, _ = standing_pose((x, y), rng)
+    environment.set_state(qpos, np.zeros(environment.model.nv))
+
+
+def turned(direction: Array, angle_rad: float) -> Array:
+    """The direction after a turn to the left."""
+    x, y = direction
+    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
+    return np.array([cos * x - sin * y, sin * x + cos * y])

@@ -82,11 +82,8 @@ class _GoalSeeker(Behaviour):
     def direction(self, simulator: Simulator, row: int) -> Array:
         """Unit vector to the centre of the next cell on the path, at last to the goal's."""
         position = simulator.position
-        cell = self.maze.cell(*position)
-        if self.to_goal and cell == self._goal_cell:
-            target = self._goal_xy
-        else:
-            target = self.maze.center(*self.maze.next_cell(cell, self._goal_cell))
+        goal = self._goal_xy if self.to_goal else self.maze.center(*self._goal_cell)
+        target = self.maze.waypoint(self.maze.cell(*position), goal)
         return _unit(np.subtract(target, position))
 
     @abstractmethod

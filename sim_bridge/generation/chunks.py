@@ -12,7 +12,7 @@ import numpy as np
 from sim_bridge.generation.episodes import Episode
 from sim_bridge.generation.plan import GenerationPlan
 
-PER_ROW = ('observations', 'actions', 'qpos', 'qvel')
+PER_ROW = ('observations', 'actions', 'qpos', 'qvel', 'terminals')
 _SETTINGS = 'settings.json'
 
 

@@ -5,8 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim_bridge.controllers import DirectionFollower
+from sim_bridge.controllers.posture import has_fallen
 from sim_bridge.generation.behaviours import BEHAVIOURS, Kind
 from sim_bridge.simulator import Simulator
+
+CUT_S = 1.0
+"""What is left out before a fall, seconds."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +31,11 @@ class Episode:
     qvel: np.ndarray
     goals_reached: int
 
+    @property
+    def terminals(self) -> np.ndarray:
+        """True at the last row, shape (T + 1,), bool."""
+        return np.arange(len(self.actions)) == len(self.actions) - 1
+
 
 def episode_generator(seed: int, validation: bool, index: int) -> np.random.Generator:
     """Random generator of one episode.
@@ -46,12 +55,15 @@ def record_episode(
     noise: float,
     rng: np.random.Generator,
     to_goal: bool = False,
+    cut_falls: bool = False,
 ) -> Episode:
     """Run the behaviour policy for one episode of `num_rows` rows.
 
     At every row the follower is given the behaviour's direction; Gaussian noise of standard
     deviation `noise` is added to its action, and the sum is clipped to [-1, 1]. With `to_goal` it
-    walks to the goals themselves, not to the centres of their cells.
+    walks to the goals themselves, not to the centres of their cells. With
+    `cut_falls` a fall ends the episode, and its last second is left out; an episode of which
+    nothing remains is recorded again.
 
     Source: OGBench, `data_gen_scripts/generate_locomaze.py`. Deviation: the action of the last
     row is recorded but not simulated, since no row would hold its outcome.
@@ -61,23 +73,29 @@ def record_episode(
     behaviour.begin(simulator)
 
     observations, actions, qpos, qvel = [], [], [], []
+    kept = num_rows
     for row in range(num_rows):
-        action = follower.act(observation, behaviour.direction(simulator, row))
+        qpos.append(simulator.qpos)
+        action = follower.act(observation, behaviour.direction(simulator, row), qpos[-1])
         action = np.clip(action + rng.normal(0.0, noise, action.shape), -1.0, 1.0)
         observations.append(observation)
         actions.append(action)
-        qpos.append(simulator.qpos)
         qvel.append(simulator.qvel)
         if row == num_rows - 1:
             break
         result = simulator.step(action)
+        if cut_falls and has_fallen(simulator.qpos):
+            kept = row + 1 - round(CUT_S / simulator.spec.control_period_s)
+            break
         observation = result.observation
         if result.success:
             behaviour.at_goal(simulator)
+    if kept < 2:
+        return record_episode(simulator, follower, kind, num_rows, noise, rng, to_goal, True)
     return Episode(
-        observations=np.array(observations, dtype=np.float32),
-        actions=np.array(actions, dtype=np.float32),
-        qpos=np.array(qpos, dtype=np.float32),
-        qvel=np.array(qvel, dtype=np.float32),
+        observations=np.array(observations[:kept], dtype=np.float32),
+        actions=np.array(actions[:kept], dtype=np.float32),
+        qpos=np.array(qpos[:kept], dtype=np.float32),
+        qvel=np.array(qvel[:kept], dtype=np.float32),
         goals_reached=behaviour.goals_reached,
     )

@@ -190,9 +190,9 @@ def _assemble(
     """Join the chunks into the two files of the dataset."""
     train = [folder.read(chunk) for chunk in chunks if not chunk.validation]
     validation = [folder.read(chunk) for chunk in chunks if chunk.validation]
-    validation_set = _join(validation, plan.rows_per_episode)
+    validation_set = _join(validation)
     validation_set.save(paths.validation)
-    train_set = _join(train, plan.rows_per_episode)
+    train_set = _join(train)
     train_set.save(paths.train)
 
     description = describe_environment(plan.environment)
@@ -204,25 +204,23 @@ def _assemble(
         validation_rows=validation_set.num_rows,
         goals_per_episode=float(np.concatenate([part['goals_reached'] for part in train]).mean()),
         coverage=float((visited & free).sum() / free.sum()),
-        falls_per_episode=_falls(train, plan.rows_per_episode) / plan.episodes,
+        falls_per_episode=_falls(train) / plan.episodes,
     )
 
 
-def _falls(parts: list[dict[str, np.ndarray]], rows_per_episode: int) -> int:
+def _falls(parts: list[dict[str, np.ndarray]]) -> int:
     return sum(
-        count_falls(part['qpos'][start : start + rows_per_episode])
+        count_falls(qpos)
         for part in parts
-        for start in range(0, len(part['qpos']), rows_per_episode)
+        for qpos in np.split(part['qpos'], np.flatnonzero(part['terminals'])[:-1] + 1)
     )
 
 
-def _join(parts: list[dict[str, np.ndarray]], rows_per_episode: int) -> TrajectoryDataset:
+def _join(parts: list[dict[str, np.ndarray]]) -> TrajectoryDataset:
     joined = {name: np.concatenate([part[name] for part in parts]) for name in PER_ROW}
-    terminals = np.zeros(len(joined['observations']), dtype=bool)
-    terminals[rows_per_episode - 1 :: rows_per_episode] = True
     return TrajectoryDataset.from_arrays(
         joined['observations'],
         joined['actions'],
-        terminals,
+        joined['terminals'],
         extras={'qpos': joined['qpos'], 'qvel': joined['qvel']},
     )

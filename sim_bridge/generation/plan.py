@@ -26,6 +26,7 @@ class GenerationPlan(BaseModel):
     noise: float = Field(ge=0, description='Standard deviation of the action noise.')
     seed: int = Field(ge=0, description='Random seed.')
     to_goal: bool = Field(False, description="Walk to the goal, not to its cell's center.")
+    cut_falls: bool = Field(False, description='End an episode a second before a fall.')
 
     @property
     def validation_episodes(self) -> int:
@@ -50,6 +51,7 @@ def plan_dataset(
     """Plan a dataset, with OGBench's size and noise by default.
 
     Mazes of gymnasium-robotics, for which OGBench has no data, get those of its point maze.
+    Humanoids cannot get up, so their episodes end before a fall.
 
     Raises:
         ValueError: If the environment is unknown.
@@ -65,7 +67,12 @@ def plan_dataset(
     asked = {'episodes': episodes, 'rows_per_episode': rows_per_episode, 'noise': noise}
     given = {key: value for key, value in asked.items() if value is not None}
     return GenerationPlan(
-        environment=name, kind=kind, seed=seed, to_goal=to_goal, **{**usual, **given}
+        environment=name,
+        kind=kind,
+        seed=seed,
+        to_goal=to_goal,
+        cut_falls=name.startswith('humanoidmaze'),
+        **{**usual, **given},
     )
 
 

@@ -67,6 +67,7 @@ def _record(
             plan.noise,
             episode_generator(plan.seed, chunk.validation, index),
             plan.to_goal,
+            plan.cut_falls,
         )
         for index in range(chunk.start, chunk.stop)
     ]

@@ -24,6 +24,10 @@ from sim_bridge.simulator import Array, MazeDescription, SimulatorSpec, Task
 
 _DATASET_NAME = re.compile(r'(?P<maze>\w+-\w+)-(navigate|stitch|explore)-v0')
 
+STANDING_Z_M = 1.3
+"""Height of a humanoid's torso with straight legs and the feet just above the floor."""
+_JOINT_NOISE_RAD = 0.08
+
 # Teleports take what is within 1.5 m of their center after a step; no robot moves 2 m in a step.
 _TELEPORT_REACH_M = 3.5
 
@@ -88,7 +92,8 @@ class OGBenchMaze(GymMaze):
     def __init__(self, name: str) -> None:
         """Load the physics of one of the `names`."""
         super().__init__(describe(name))
-        self._env = _make_environment(name)
+        self._env = make_environment(name)
+        self._is_humanoid = name.startswith('humanoidmaze')
         teleports = self._env._teleport_info or {'teleport_in_xys': []}
         self._teleport_xys = teleports['teleport_in_xys']
         self._noise = np.random.RandomState(0)
@@ -122,7 +127,19 @@ class OGBenchMaze(GymMaze):
         if start_xy is not None:
             self._env.set_xy(np.array(start_xy, dtype=np.float64))
             observation = self._env.get_ob()
-        return observation
+        return self.stand() if self._is_humanoid else observation
+
+    def stand(self) -> Array:
+        """Put the humanoid on its feet where it is and return the observation.
+
+        OGBench starts its tasks with a humanoid in a random pose that falls to the floor, and
+        none of its datasets or of our controllers shows how to get up. Other robots start
+        upright and are left as they are.
+        """
+        if self._is_humanoid:
+            qpos, _ = standing_pose(self.position, self._noise)
+            self._env.set_state(qpos, np.zeros(self._env.model.nv))
+        return np.array(self._env.get_ob())
 
     def close(self) -> None:
         """Free the physics and the renderer."""
@@ -176,7 +193,20 @@ class OGBenchMaze(GymMaze):
         return any(math.dist(self.position, xy) <= _TELEPORT_REACH_M for xy in self._teleport_xys)
 
 
-def _make_environment(name: str) -> Any:
+def standing_pose(
+    xy: tuple[float, float], rng: np.random.Generator | np.random.RandomState
+) -> tuple[Array, float]:
+    """Generalised positions, shape (28,), of a humanoid that stands, and its yaw in radians.
+
+    The yaw is drawn uniformly; the joints are near their middle.
+    """
+    yaw = rng.uniform(-math.pi, math.pi)
+    joints = rng.normal(0.0, _JOINT_NOISE_RAD, 21)
+    quaternion = (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
+    return np.concatenate([xy, (STANDING_Z_M,), quaternion, joints]), float(yaw)
+
+
+def make_environment(name: str) -> Any:
     """OGBench's environment without gymnasium's wrappers; the simulator does their work."""
     choose_opengl_library()
     import gymnasium
@@ -186,3 +216,12 @@ def _make_environment(name: str) -> Any:
     # OGBench writes the model to a temporary file, loads it, and leaves it behind.
     Path(environment.fullpath).unlink()
     return environment
+
+
+def open_floor(robot: str) -> Any:
+    """OGBench's `ant` or `humanoid` on a floor without walls, without gymnasium's wrappers."""
+    choose_opengl_library()
+    from ogbench.locomaze.ant import AntEnv
+    from ogbench.locomaze.humanoid import HumanoidEnv
+
+    return {'ant': AntEnv, 'humanoid': HumanoidEnv}[robot]()

@@ -54,8 +54,8 @@ def test_flags_reach_the_plan() -> None:
     [
         (['--environment', 'pointmaze-mediun-v0'], "did you mean 'pointmaze-medium-v0'"),
         (
-            ['--environment', 'humanoidmaze-medium-v0'],
-            'metagcttt controller train --robot humanoid',
+            ['--environment', 'humanoidmaze-medium-v0', '--controller', 'nowhere'],
+            'nowhere: no direction controller there',
         ),
         (['--output', 'here.zip'], 'must end in .npz, got here.zip'),
         (['--kind', 'play'], 'play'),

@@ -8,21 +8,32 @@ from metagcttt_core.config import Settings
 from metagcttt_core.files import write_json
 import numpy as np
 from pydantic import Field
-from sim_bridge.controllers import load_follower
+from sim_bridge.controllers import LearnedFollower, load_follower
 from sim_bridge.controllers.direction import BUNDLED
-from sim_bridge.controllers.walk import Walk, walk_along
+from sim_bridge.controllers.walk import (
+    QUARTER_TURNS_RAD,
+    TURN_EVERY_S,
+    Walk,
+    walk_along,
+    walk_to_goal,
+)
+from sim_bridge.mazes.ogbench import OGBenchMaze
 from sim_bridge.mazes.ogbench_layouts import UNIT_M
 from tqdm import tqdm
 
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.plots import controller_picture, save
+from metagcttt_tools.common.results import markdown_table
 from metagcttt_tools.common.session import provenance
+from metagcttt_tools.controller.film import film
 
 _DESCRIPTION = """Measure how well a learned controller follows directions.
 
-Example: metagcttt controller measure --controller out/ant-controller/controller
-Walks along each direction on an open floor from random start poses, without noise; prints a
-table and writes OUT.json and OUT.png."""
+Example: metagcttt controller measure --controller out/humanoid-controller/controller
+Walks along each direction on an open floor; then as long straight on and with turns by 0 or 90
+degrees every 2.5 s, each without and with noisy actions; then to the goals of the robot's mazes
+by the shortest way, where a fall ends an episode. All start upright in random poses.
+Prints tables and writes OUT.json, OUT.md and OUT.png, and with --gif a picture of it walking."""
 
 
 class MeasureSettings(Settings):
@@ -32,8 +43,13 @@ class MeasureSettings(Settings):
     directions: int = Field(8, ge=1, description='directions, spread evenly')
     duration_s: float = Field(20.0, gt=0, description='of a walk, simulated seconds')
     repeats: int = Field(5, ge=1, description='walks per direction, each from another pose')
-    seed: int = Field(0, ge=0, description='of the start poses')
+    walks: int = Field(20, ge=1, description='walks straight on or with turns')
+    mazes: tuple[str, ...] = Field(('medium', 'large'), description='layouts to reach goals in')
+    episodes_per_task: int = Field(2, ge=1, description='in each maze')
+    action_noise: float = Field(0.2, ge=0, description='standard deviation in the noisy rows')
+    seed: int = Field(0, ge=0, description='random seed')
     out: Path = Field(Path('out/controller'), description='files to write')
+    gif: Path | None = Field(None, description='also film a walk with turns, to this file')
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -50,18 +66,35 @@ def main(argv: list[str] | None = None) -> None:
         ]
         for direction in tqdm(compass(settings.directions), unit='direction')
     ]
-    rows = [summarize(same_direction) for same_direction in walks]
+    tables = {
+        'directions': [summarize(same_direction) for same_direction in walks],
+        'walks': [
+            summarize_walks(follower, settings, turns, noise)
+            for turns in ((), QUARTER_TURNS_RAD)
+            for noise in (0.0, settings.action_noise)
+        ],
+        'mazes': [
+            summarize_goals(follower, settings, layout, noise)
+            for layout in settings.mazes
+            for noise in (0.0, settings.action_noise)
+        ],
+    }
     report = {
-        'settings': settings.model_dump(mode='json', exclude={'controller', 'out'}),
+        'settings': settings.model_dump(mode='json', exclude={'controller', 'out', 'gif'}),
         'controller_sha256': follower.sha256,
         'training': follower.metadata,
         **provenance(),
-        'directions': rows,
+        **tables,
     }
     write_json(settings.out.with_suffix('.json'), report)
+    text = format_tables(tables)
+    settings.out.with_suffix('.md').write_text(text, encoding='utf-8')
     save(controller_picture(walks), settings.out.with_suffix('.png'))
-    print(format_table(rows))
-    print(f'results: {settings.out.with_suffix(".json")} and .png')
+    print(text)
+    print(f'results: {settings.out.with_suffix(".json")}, .md and .png')
+    if settings.gif is not None:
+        film(follower, settings.gif, settings.seed)
+        print(f'film: {settings.gif}')
 
 
 def compass(count: int) -> list[np.ndarray]:
@@ -86,17 +119,94 @@ def summarize(walks: list[Walk]) -> dict[str, Any]:
     }
 
 
-def format_table(rows: list[dict[str, Any]]) -> str:
-    """One line a direction, as Markdown."""
-    lines = [
-        f'| direction | speed (m/s) | slowest walk | control steps per {UNIT_M:g} m cell '
-        '| drift (m) | falls |',
-        '|---|---|---|---|---|---|',
-    ]
-    for row in rows:
-        steps = 'never' if row['steps_per_cell'] is None else f'{row["steps_per_cell"]:.0f}'
-        lines.append(
-            f'| {row["direction_deg"]}° | {row["speed_m_s"]:.2f} | {row["slowest_m_s"]:.2f} '
-            f'| {steps} | {row["drift_m"]:.1f} | {row["falls"]} in {row["walks"]} |'
+def summarize_walks(
+    follower: LearnedFollower,
+    settings: MeasureSettings,
+    turns_rad: tuple[float, ...],
+    action_noise: float,
+) -> dict[str, Any]:
+    """The figures of walks straight on or with turns, each along another direction."""
+    walks = [
+        walk_along(
+            follower, direction, settings.duration_s, settings.seed + number, turns_rad,
+            action_noise,
         )
-    return '\n'.join(lines)
+        for number, direction in enumerate(compass(settings.walks))
+    ]  # fmt: skip
+    falls, walked_s = sum(walk.falls for walk in walks), sum(walk.duration_s for walk in walks)
+    return {
+        'turns_deg': [round(math.degrees(turn)) for turn in turns_rad],
+        'action_noise': action_noise,
+        'speed_m_s': float(np.mean([walk.speed for walk in walks])),
+        'falls': falls,
+        'walked_s': walked_s,
+        'falls_per_minute': 60 * falls / walked_s,
+    }
+
+
+def summarize_goals(
+    follower: LearnedFollower, settings: MeasureSettings, layout: str, action_noise: float
+) -> dict[str, Any]:
+    """The figures of the tasks of a maze."""
+    maze = OGBenchMaze(f'{follower.robot}maze-{layout}-v0')
+    with maze:
+        runs = [
+            walk_to_goal(follower, maze, task.task_id, settings.seed + number, action_noise)
+            for task in maze.tasks
+            for number in range(settings.episodes_per_task)
+        ]
+    durations = [run.duration_s for run in runs if run.reached]
+    falls, walked_s = sum(run.fallen for run in runs), sum(run.duration_s for run in runs)
+    return {
+        'maze': f'{follower.robot}maze-{layout}-v0',
+        'action_noise': action_noise,
+        'reached': len(durations),
+        'episodes': len(runs),
+        'seconds_to_goal': float(np.mean(durations)) if durations else None,
+        'falls': falls,
+        'walked_s': walked_s,
+        'falls_per_minute': 60 * falls / walked_s,
+    }
+
+
+def format_tables(tables: dict[str, list[dict[str, Any]]]) -> str:
+    """The figures as Markdown."""
+    cell = f'control steps per {UNIT_M:g} m cell'
+    directions = [
+        {
+            'direction': f'{row["direction_deg"]}°',
+            'speed (m/s)': f'{row["speed_m_s"]:.2f}',
+            'slowest walk': f'{row["slowest_m_s"]:.2f}',
+            cell: 'never' if row['steps_per_cell'] is None else f'{row["steps_per_cell"]:.0f}',
+            'drift (m)': f'{row["drift_m"]:.1f}',
+            'falls': f'{row["falls"]} in {row["walks"]}',
+        }
+        for row in tables['directions']
+    ]
+    walks = [
+        {
+            'walk': f'0 or ±90° every {TURN_EVERY_S:g} s' if row['turns_deg'] else 'straight on',
+            'action noise': f'{row["action_noise"]:g}',
+            'speed (m/s)': f'{row["speed_m_s"]:.2f}',
+            **_falls(row),
+        }
+        for row in tables['walks']
+    ]
+    mazes = [
+        {
+            'maze': row['maze'],
+            'action noise': f'{row["action_noise"]:g}',
+            'goals': f'{row["reached"]} of {row["episodes"]}',
+            'seconds to goal': 'never' if not row['reached'] else f'{row["seconds_to_goal"]:.1f}',
+            **_falls(row),
+        }
+        for row in tables['mazes']
+    ]
+    return '\n\n'.join(markdown_table(rows) for rows in (directions, walks, mazes) if rows) + '\n'
+
+
+def _falls(row: dict[str, Any]) -> dict[str, str]:
+    return {
+        'falls': f'{row["falls"]} in {row["walked_s"]:.0f} s',
+        'falls a minute': f'{row["falls_per_minute"]:.2f}',
+    }

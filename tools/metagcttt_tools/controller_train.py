@@ -1,4 +1,4 @@
-"""Train the controller that walks a robot along a direction, which offline data needs."""
+"""Train the controller that walks the ant along a direction, which offline data needs."""
 
 from collections.abc import Callable
 import json
@@ -12,17 +12,17 @@ from pydantic import Field
 from safetensors import safe_open
 import safetensors.torch
 from sim_bridge.controllers import LearnedFollower
-from sim_bridge.controllers.training_ground import Robot, TrainingGround
-import torch
+from sim_bridge.controllers.training_ground import TrainingGround
 from torch import Tensor
 from tqdm import tqdm
 
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.run_log import RunLog
 from metagcttt_tools.common.session import provenance, stop_on_signal, use_threads, write_settings
+from metagcttt_tools.controller.replay import ReplayBuffer
 from metagcttt_tools.controller.sac import SAC, SACConfig
 
-_DESCRIPTION = """Train the controller that walks a robot along a direction (SAC).
+_DESCRIPTION = """Train the controller that walks the ant along a direction (SAC).
 
 Example: metagcttt controller train --out out/ant-controller
 Writes OUT/controller, OUT/checkpoint.safetensors (replay buffer included) and logs.
@@ -32,7 +32,6 @@ Ctrl-C saves and ends; --resume goes on, with a new episode."""
 class TrainControllerSettings(Settings):
     """Settings of the tool."""
 
-    robot: Robot = Field('ant', description='what learns to walk')
     out: Path = Field(Path('out/ant-controller'), description='folder of the run')
     steps: int = Field(200_000, ge=1, description='environment steps')
     decay_steps: int = Field(
@@ -54,70 +53,13 @@ class TrainControllerSettings(Settings):
         return self.out / 'checkpoint.safetensors'
 
 
-class ReplayBuffer:
-    """The latest transitions of a run; a new one takes the place of the oldest when it is full.
-
-    Attributes:
-        arrays: The transitions by name, one row each; rows from `size` on are not in use.
-        added: Number of transitions so far, those that are gone included.
-    """
-
-    def __init__(self, capacity: int, obs_dim: int, act_dim: int) -> None:
-        """Reserve the memory."""
-        shapes: dict[str, tuple[int, ...]] = {
-            'observations': (obs_dim,),
-            'actions': (act_dim,),
-            'next_observations': (obs_dim,),
-            'rewards': (),
-            'masks': (),
-        }
-        self.arrays = {
-            name: np.empty((capacity, *shape), np.float32) for name, shape in shapes.items()
-        }
-        self.capacity = capacity
-        self.added = 0
-
-    @property
-    def size(self) -> int:
-        """Number of transitions there are."""
-        return min(self.added, self.capacity)
-
-    def add(self, **transition: Any) -> None:
-        """Append one transition."""
-        for name, array in self.arrays.items():
-            array[self.added % self.capacity] = transition[name]
-        self.added += 1
-
-    def sample(self, count: int, rng: np.random.Generator) -> dict[str, Tensor]:
-        """Draw transitions uniformly, with replacement."""
-        idxs = rng.integers(self.size, size=count)
-        return {
-            name: torch.from_numpy(array.take(idxs, axis=0)) for name, array in self.arrays.items()
-        }
-
-    def tensors(self) -> dict[str, Tensor]:
-        """The transitions so far, by name; they share the memory."""
-        rows = {
-            f'replay.{name}': torch.from_numpy(array[: self.size])
-            for name, array in self.arrays.items()
-        }
-        return {**rows, 'replay.added': torch.tensor(self.added)}
-
-    def load_tensors(self, tensors: dict[str, Tensor]) -> None:
-        """Take over what `tensors` gave."""
-        for name, array in self.arrays.items():
-            rows = tensors[f'replay.{name}']
-            array[: len(rows)] = rows
-        self.added = int(tensors['replay.added'])
-
-
 class ControllerTraining:
     """One run: its robot, learner and replay buffer."""
 
     def __init__(self, settings: TrainControllerSettings) -> None:
         """Build everything, fresh."""
         self.settings = settings
-        self.ground = TrainingGround(settings.robot)
+        self.ground = TrainingGround()
         dims = self.ground.obs_dim, self.ground.act_dim
         self.learner = SAC(*dims, settings.sac, settings.seed)
         self.replay = ReplayBuffer(settings.replay_size, *dims)
@@ -154,7 +96,7 @@ class ControllerTraining:
             done = step + 1
             if done > settings.random_steps and done % settings.update_every == 0:
                 batch = replay.sample(settings.sac.batch_size, rng)
-                self.learner.set_lr(settings.sac.lr * self._lr_share(step))
+                self.learner.scale_lr(self._lr_share(step))
                 meters.losses = self.learner.update(batch, rng)
             if done % settings.log_every == 0:
                 log(done, meters.read())
@@ -179,7 +121,7 @@ class ControllerTraining:
             'training': _decisive(self.settings),
             **provenance(),
         }
-        return LearnedFollower(self.settings.robot, tuple(weights), tuple(biases), metadata)
+        return LearnedFollower('ant', tuple(weights), tuple(biases), metadata)
 
     def save(self) -> None:
         """Write the controller, then the checkpoint, each whole or not at all."""
@@ -261,7 +203,7 @@ def _run(settings: TrainControllerSettings) -> None:
     with (
         stop_on_signal() as stop,
         RunLog(settings.out, first) as run_log,
-        tqdm(total=settings.steps, initial=first, unit='step', desc=settings.robot) as bar,
+        tqdm(total=settings.steps, initial=first, unit='step', desc='ant') as bar,
     ):
 
         def log(step: int, scalars: dict[str, float]) -> None:
@@ -278,5 +220,5 @@ def _run(settings: TrainControllerSettings) -> None:
 
 def _decisive(settings: TrainControllerSettings) -> dict[str, Any]:
     """The settings that decide the course; how long it goes on may change on the way."""
-    fields = {'robot', 'update_every', 'replay_size', 'random_steps', 'sac', 'seed', 'threads'}
+    fields = {'update_every', 'replay_size', 'random_steps', 'sac', 'seed', 'threads'}
     return settings.model_dump(mode='json', include=fields)

@@ -34,8 +34,8 @@ Example, 1000 episodes of 1001 rows, about two minutes on one core:
 writes data/pointmaze-medium-navigate-v0.npz, ...-val.npz (a tenth as many episodes),
 ...-v0.json (settings, versions, statistics) and ...-v0.png (where the robot has been).
 
-The ant walks by the controller in sim_bridge/controllers/weights. The humanoid needs one to be
-trained first (metagcttt controller train --robot humanoid) and given as --controller.
+Ant and humanoid walk by the controllers in sim_bridge/controllers/weights; --controller takes
+another. The humanoid starts on its feet, and its episodes end a second before a fall.
 Where there is a network, metagcttt download fetches OGBench's published files instead."""
 
 

@@ -59,7 +59,10 @@ PROGRAMS: dict[str, Program | Group] = {
     ),
     'controller': Group(
         {
-            'train': Program('controller_train', 'Train a controller (SAC).'),
+            'train': Program('controller_train', "Train the ant's controller (SAC)."),
+            'train-humanoid': Program(
+                'controller_train_humanoid', "Train the humanoid's controller (SAC)."
+            ),
             'measure': Program('controller_measure', 'Measure how well it follows directions.'),
         },
         'Controllers that walk a robot along a direction, which make data.',

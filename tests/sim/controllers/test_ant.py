@@ -58,7 +58,7 @@ def test_follower_is_as_symmetric_as_the_ant(angle: float, turns: int, seed: int
 
     def act(own_and_direction: np.ndarray) -> np.ndarray:
         observation = np.concatenate([rng.normal(size=2), own_and_direction[:27]])
-        return follower.act(observation, own_and_direction[27:])
+        return follower.act(observation, own_and_direction[27:], np.zeros(15))
 
     np.testing.assert_allclose(act(turned), turn_action(act(inputs), turns), atol=1e-6)
 
@@ -71,7 +71,7 @@ def test_direction_inside_the_learned_quarter_goes_to_the_network_as_it_is() -> 
     for degrees, same in ((-22, True), (0, True), (67, True), (68, False), (-23, False)):
         direction = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
         plain = follower.network(np.concatenate([observation[2:], direction]))
-        assert np.array_equal(follower.act(observation, direction), plain) == same
+        assert np.array_equal(follower.act(observation, direction, np.zeros(15)), plain) == same
 
 
 @pytest.mark.mujoco

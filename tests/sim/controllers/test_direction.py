@@ -16,7 +16,7 @@ def untrained(robot: str, obs_dim: int, act_dim: int) -> LearnedFollower:
 def test_point_moves_in_the_direction_itself() -> None:
     follower = make_direction_follower(describe_environment('pointmaze-giant-v0').spec)
     direction = np.array([0.6, -0.8])
-    np.testing.assert_array_equal(follower.act(np.zeros(2), direction), direction)
+    np.testing.assert_array_equal(follower.act(np.zeros(2), direction, np.zeros(2)), direction)
 
 
 @pytest.mark.mujoco
@@ -25,27 +25,30 @@ def test_pushed_point_reaches_its_speed_along_the_direction_and_keeps_it() -> No
         follower = make_direction_follower(simulator.spec)
         observation = simulator.reset_free(seed=0, start_xy=(-2.0, 0.0))
         for _ in range(80):
-            action = np.clip(follower.act(observation, np.array([1.0, 0.0])), -1, 1)
-            observation = simulator.step(action).observation
+            action = follower.act(observation, np.array([1.0, 0.0]), simulator.qpos)
+            observation = simulator.step(np.clip(action, -1, 1)).observation
         assert simulator.position[0] > 0
         np.testing.assert_allclose(observation[2:], (3.0, 0.0), atol=0.2)
 
 
-def test_robot_without_a_controller_is_refused_with_what_to_do() -> None:
+def test_robot_without_a_controller_is_refused_with_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr('sim_bridge.controllers.direction.BUNDLED', tmp_path)
     spec = describe_environment('humanoidmaze-medium-v0').spec
     with pytest.raises(
         ControllerError,
         match=r'humanoidmaze-medium-v0: .*learned direction controller .69 observation and 21 '
-        'action.*controller train --robot humanoid.*published datasets',
+        'action.*controller train-humanoid.*published datasets',
     ):
         make_direction_follower(spec)
 
 
 def test_given_controller_is_used(tmp_path: Path) -> None:
-    untrained('humanoid', 69, 21).save(tmp_path)
+    untrained('humanoid', 67, 21).save(tmp_path)
     spec = describe_environment('humanoidmaze-medium-v0').spec
     follower = make_direction_follower(spec, tmp_path)
-    assert follower.act(np.zeros(69), np.array([1.0, 0.0])).shape == (21,)
+    assert follower.act(np.zeros(69), np.array([1.0, 0.0]), np.ones(28)).shape == (21,)
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ def test_action_is_a_perceptron_of_own_state_and_direction() -> None:
     biases = np.array([0.5, 0.0], np.float32), np.array([-5.0], np.float32)
     snail = LearnedFollower('snail', weights, biases)
     # Own state 0.25, direction (0.6, -0.01): hidden 0.25 + 6 - 1 + 0.5 = 5.75 and max(-0.25, 0).
-    action = snail.act(np.array([8.0, 9.0, 0.25]), np.array([0.6, -0.01]))
+    action = snail.act(np.array([8.0, 9.0, 0.25]), np.array([0.6, -0.01]), np.zeros(3))
     np.testing.assert_allclose(action, np.tanh([0.75]), rtol=1e-6)
     assert action.dtype == np.float64
     assert (snail.obs_dim, snail.act_dim) == (3, 1)

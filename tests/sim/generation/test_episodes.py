@@ -1,5 +1,9 @@
 """Recorded episodes: what the behaviour policy does and what is stored of it."""
 
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, cast
+
 import numpy as np
 import pytest
 from sim_bridge import maze_map, Simulator
@@ -7,6 +11,7 @@ from sim_bridge.controllers import PointFollower
 from sim_bridge.generation.behaviours import BEHAVIOURS, Kind, Stitch
 from sim_bridge.generation.episodes import Episode, episode_generator, record_episode
 from sim_bridge.maze_map import Cell, MazeMap
+from sim_bridge.simulator import StepResult
 
 pytestmark = pytest.mark.mujoco
 KINDS: list[Kind] = ['navigate', 'stitch', 'explore']
@@ -122,3 +127,54 @@ def test_noise_has_the_asked_deviation(built_point: Simulator) -> None:
     inner = np.abs(noisy.actions.reshape(50, 10, 2)).max(axis=(1, 2)) < 0.99  # nothing was cut
     spread = noisy.actions.reshape(50, 10, 2)[inner].std(axis=1, ddof=1)
     assert np.sqrt((spread**2).mean()) == pytest.approx(0.05, rel=0.1)
+
+
+class Spills:
+    """A point whose episodes "fall" after so many steps each; a second is four of its rows."""
+
+    def __init__(self, simulator: Simulator, steps: Sequence[int]) -> None:
+        self._simulator = simulator
+        self._steps = iter(steps)
+        self.spec = replace(simulator.spec, control_period_s=0.25)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._simulator, name)
+
+    def reset_free(self, **options: Any) -> np.ndarray:
+        self._left = next(self._steps)
+        return self._simulator.reset_free(**options)
+
+    def step(self, action: np.ndarray) -> StepResult:
+        self._left -= 1
+        return self._simulator.step(action)
+
+    @property
+    def qpos(self) -> np.ndarray:
+        qpos = np.zeros(28)
+        qpos[:2], qpos[2] = self._simulator.position, 0.5 if self._left <= 0 else 1.3
+        return qpos
+
+
+@pytest.mark.parametrize(('steps', 'rows'), [([10], 6), ([6], 2), ([5, 3, 9], 5), ([30], 20)])
+def test_episode_is_cut_a_second_before_a_fall(
+    built_point: Simulator, steps: list[int], rows: int
+) -> None:
+    spill = cast(Simulator, Spills(built_point, steps))
+    rng = episode_generator(0, validation=False, index=0)
+    episode = record_episode(
+        spill, PointFollower(), 'navigate', 20, 0.5, rng, to_goal=False, cut_falls=True
+    )
+    assert [len(episode.actions), len(episode.qpos), len(episode.qvel)] == 3 * [rows]
+    assert episode.terminals.tolist() == [*(rows - 1) * [False], True]
+    if len(steps) == 1:
+        whole = record(built_point, 'navigate', 20)
+        np.testing.assert_array_equal(episode.observations, whole.observations[:rows])
+
+
+def test_falls_do_not_end_an_episode_unless_asked(built_point: Simulator) -> None:
+    spill = cast(Simulator, Spills(built_point, [1]))
+    rng = episode_generator(0, validation=False, index=0)
+    episode = record_episode(spill, PointFollower(), 'navigate', 20, 0.5, rng)
+    np.testing.assert_array_equal(
+        episode.observations, record(built_point, 'navigate', 20).observations
+    )

@@ -244,8 +244,12 @@ def test_bad_requests_are_refused_before_anything_is_written(tmp_path: Path) -> 
         generate(small(), tmp_path / 'maze.zip')
     with pytest.raises(GenerationError, match='processes must be at least 1, got 0'):
         generate(small(), tmp_path / 'maze.npz', processes=0)
-    with pytest.raises(ControllerError, match='humanoidmaze-medium-v0'):
-        generate(plan_dataset('humanoidmaze-medium-v0', 'navigate'), tmp_path / 'maze.npz')
+    with pytest.raises(ControllerError, match='nowhere: no direction controller'):
+        generate(
+            plan_dataset('humanoidmaze-medium-v0', 'navigate'),
+            tmp_path / 'maze.npz',
+            controller=tmp_path / 'nowhere',
+        )
     assert contents(tmp_path) == {}
 
 

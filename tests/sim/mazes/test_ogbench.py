@@ -11,6 +11,8 @@ import numpy as np
 import ogbench.locomaze  # registers the environments  # noqa: F401
 import pytest
 from sim_bridge import make_simulator, Simulator, SimulatorError
+from sim_bridge.controllers.posture import has_fallen
+from sim_bridge.mazes.ogbench import OGBenchMaze
 
 pytestmark = pytest.mark.mujoco
 
@@ -180,6 +182,32 @@ def test_free_start_keeps_the_pose_of_a_walking_robot() -> None:
         assert placed[2] == pytest.approx(0.75, abs=0.1)  # torso height
         assert ant.position == (8.0, 8.0)
         np.testing.assert_array_equal(placed, np.concatenate([ant.qpos, ant.qvel]))
+
+
+def test_humanoid_starts_free_episodes_on_its_feet_and_tasks_as_in_ogbench() -> None:
+    with make_simulator('humanoidmaze-medium-v0') as humanoid:
+        placed = humanoid.reset_free(seed=2, start_xy=(8.0, 8.0))
+        assert placed[:2].tolist() == [8.0, 8.0]
+        assert placed[23] == pytest.approx(1.49)  # height of the head
+        assert not humanoid.qvel.any()
+        np.testing.assert_array_equal(placed, humanoid.reset_free(seed=2, start_xy=(8.0, 8.0)))
+        yaws = [humanoid.reset_free(seed=seed, start_xy=(8.0, 8.0)) for seed in range(2)]
+        assert not np.array_equal(*yaws)
+        for _ in range(60):
+            humanoid.step(np.zeros(21))
+        assert has_fallen(humanoid.qpos)
+        before = humanoid.reset(task_id=1, seed=0)[0]
+        assert isinstance(humanoid, OGBenchMaze)
+        after = humanoid.stand()
+        assert after[23] == pytest.approx(1.49)
+        assert after[:2].tolist() == before[:2].tolist()
+        assert before[36:39].tolist() != pytest.approx([0, 0, 1], abs=0.01)
+
+
+def test_standing_robots_are_left_as_they_are() -> None:
+    with OGBenchMaze('antmaze-medium-v0') as ant:
+        observation, _ = ant.reset(task_id=1, seed=0)
+        np.testing.assert_array_equal(ant.stand(), observation)
 
 
 def test_goal_can_be_an_observation() -> None:

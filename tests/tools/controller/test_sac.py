@@ -119,3 +119,43 @@ def test_learns_which_action_is_rewarded() -> None:
     wanted = np.linspace(-0.7, 0.7, 5)
     chosen = [np.mean([learner.act(np.array([x]), rng) for _ in range(50)]) for x in wanted]
     np.testing.assert_allclose(chosen, wanted, atol=0.2)
+
+
+def test_update_of_the_critics_alone_leaves_actor_and_temperature() -> None:
+    config = SACConfig(**SMALL, critic_lr=0.01)
+    learner = SAC(3, 2, config, seed=0)
+    learner.update(batch(16), np.random.default_rng(0))
+    before = {name: tensor.clone() for name, tensor in learner.tensors().items()}
+    learner.update(batch(16, seed=1), np.random.default_rng(1), actor=False)
+    changed = {
+        name.split('.')[0]
+        for name, tensor in learner.tensors().items()
+        if not torch.equal(tensor, before[name])
+    }
+    assert changed == {'critic', 'target', 'adam'}
+    assert [group['lr'] for group in learner.optimizer.param_groups] == [3e-4, 0.01, 3e-4]
+    learner.scale_lr(0.5)
+    assert [group['lr'] for group in learner.optimizer.param_groups] == [1.5e-4, 0.005, 1.5e-4]
+
+
+def test_actor_may_follow_the_first_critic_alone() -> None:
+    config = SACConfig(**SMALL, actor_critics='first', actor_layer_norm=True)
+    learner, data = SAC(3, 2, config, seed=0), batch(32)
+    rng = np.random.default_rng(4)
+    _, noise = learner.noise(32, rng), learner.noise(32, rng)
+    actions, log_probs = learner._sample(data['observations'], noise)
+    values = learner.critic(torch.cat([data['observations'], actions], dim=-1))[0, :, 0]
+    expected = torch.autograd.grad(
+        (0.02 * log_probs - values).mean(), list(learner.actor.parameters())
+    )
+    learner.update(data, np.random.default_rng(4))
+    for parameter, gradient in zip(learner.actor.parameters(), expected, strict=True):
+        torch.testing.assert_close(parameter.grad, gradient, rtol=1e-4, atol=1e-6)
+
+
+def test_actions_of_many_are_those_one_by_one() -> None:
+    learner = SAC(3, 2, SACConfig(**SMALL, log_std_range=(-20.0, -15.0)), seed=0)
+    observations = batch(5)['observations'].numpy()
+    together = learner.act_all(observations, np.random.default_rng(0))
+    single = [learner.act(row, np.random.default_rng(0)) for row in observations]
+    np.testing.assert_allclose(together, single, atol=1e-5)  # the noise is next to nothing

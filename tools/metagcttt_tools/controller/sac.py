@@ -6,7 +6,7 @@ losses are taken together and stepped by one optimiser, as in OGBench's `main_sa
 
 from itertools import pairwise
 import math
-from typing import Literal
+from typing import Any, Literal
 
 from metagcttt_core.config import Settings
 import numpy as np
@@ -15,7 +15,6 @@ import torch
 from torch import nn, Tensor
 from torch.nn import functional
 
-_LOG_STD_RANGE = (-5.0, 2.0)
 _HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
 
 
@@ -23,6 +22,7 @@ class SACConfig(Settings):
     """Settings of the learner; the defaults learn to walk the ant."""
 
     lr: float = Field(3e-4, gt=0, description='learning rate of Adam')
+    critic_lr: float | None = Field(None, gt=0, description='of the critics, if it is another')
     batch_size: int = Field(256, ge=1, description='transitions per update')
     discount: float = Field(0.99, gt=0, lt=1, description='discount per control step')
     tau: float = Field(0.005, gt=0, le=1, description='averaging of the target critics')
@@ -30,8 +30,12 @@ class SACConfig(Settings):
     temperature: float = Field(0.02, gt=0, description='weight of the entropy at the start')
     actor_hidden: tuple[int, ...] = Field((256, 256), description='units of the actor')
     critic_hidden: tuple[int, ...] = Field((256, 256), description='units of each critic')
+    actor_layer_norm: bool = Field(False, description='layer norm in the actor')
     critic_layer_norm: bool = Field(False, description='layer norm in the critics')
     critics: Literal['min', 'mean'] = Field('min', description='how the two critics are combined')
+    actor_critics: Literal['both', 'first'] = Field('both', description='what the actor follows')
+    actor_every: int = Field(1, ge=1, description='updates of the critics per update of the actor')
+    log_std_range: tuple[float, float] = Field((-5.0, 2.0), description='before the tanh')
 
 
 class StackedMLP(nn.Module):
@@ -65,11 +69,13 @@ class StackedMLP(nn.Module):
                     nn.Parameter(values.uniform_(-limit, limit, generator=generator))
                 )
 
-    def forward(self, inputs: Tensor) -> Tensor:
-        """Map (batch, in) to (copies, batch, out)."""
-        x = inputs.expand(len(self.weights[0]), *inputs.shape)
+    def forward(self, inputs: Tensor, copies: int | None = None) -> Tensor:
+        """Map (batch, in) to (copies, batch, out), by all networks or by the first ones."""
+        x = inputs.expand(copies or len(self.weights[0]), *inputs.shape)
         last = len(self.weights) - 1
         for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            if copies is not None:
+                weight, bias = weight[:copies], bias[:copies]
             x = torch.baddbmm(bias, x, weight)
             if index < last:
                 x = functional.layer_norm(x, x.shape[-1:]) if self.layer_norm else x
@@ -90,7 +96,8 @@ class SAC:
         generator = torch.Generator().manual_seed(seed)
         self.config = config
         self.act_dim = act_dim
-        self.actor = StackedMLP(1, (obs_dim, *config.actor_hidden, 2 * act_dim), generator)
+        actor_widths = (obs_dim, *config.actor_hidden, 2 * act_dim)
+        self.actor = StackedMLP(1, actor_widths, generator, layer_norm=config.actor_layer_norm)
         critic_widths = (obs_dim + act_dim, *config.critic_hidden, 1)
         self.critic, self.target = (
             StackedMLP(2, critic_widths, generator, layer_norm=config.critic_layer_norm)
@@ -101,54 +108,55 @@ class SAC:
         self._actor: list[Tensor] = list(self.actor.parameters())
         self._critic: list[Tensor] = list(self.critic.parameters())
         self._target: list[Tensor] = list(self.target.parameters())
-        self.optimizer = torch.optim.Adam(
-            [*self._actor, *self._critic, self.log_temperature], lr=config.lr, fused=True
-        )
+        groups: list[dict[str, Any]] = [
+            {'params': self._actor},
+            {'params': self._critic, 'lr': config.critic_lr or config.lr},
+            {'params': [self.log_temperature]},
+        ]
+        self.optimizer = torch.optim.Adam(groups, lr=config.lr, fused=True)
+        self._full_lr: list[float] = [group['lr'] for group in self.optimizer.param_groups]
 
-    @torch.no_grad()
     def act(self, observation: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Sampled action of shape (act_dim,), float32, for an observation of shape (obs_dim,)."""
-        inputs = torch.from_numpy(observation.astype(np.float32))[None]
-        return self._sample(inputs, self.noise(1, rng))[0][0].numpy()
+        return self.act_all(observation[None], rng)[0]
+
+    @torch.no_grad()
+    def act_all(self, observations: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Sampled actions of shape (n, act_dim) for observations of shape (n, obs_dim)."""
+        inputs = torch.from_numpy(observations.astype(np.float32))
+        return self._sample(inputs, self.noise(len(inputs), rng))[0].numpy()
 
     def noise(self, batch_size: int, rng: np.random.Generator) -> Tensor:
         """Standard normal draws for the actions of a batch, (batch, act_dim)."""
         return torch.from_numpy(rng.standard_normal((batch_size, self.act_dim), np.float32))
 
-    def update(self, batch: dict[str, Tensor], rng: np.random.Generator) -> dict[str, Tensor]:
-        """Take one step on all losses; returns scalars to log, detached."""
-        observations = batch['observations']
-        critic_loss = self._critic_loss(batch, self.noise(len(observations), rng))
-        actions, log_probs = self._sample(observations, self.noise(len(observations), rng))
-        values = self._value(self.critic, observations, actions)
-        temperature = self.log_temperature.detach().exp()
-        actor_loss = (temperature * log_probs - values).mean()
-        entropy = -log_probs.detach().mean()
+    def update(
+        self, batch: dict[str, Tensor], rng: np.random.Generator, *, actor: bool = True
+    ) -> dict[str, Tensor]:
+        """Take one step on all losses; returns scalars to log, detached.
 
-        # Gradients of each loss for its own parameters only: no pass through weights for nothing.
-        critic_gradients = torch.autograd.grad(critic_loss, self._critic)
-        actor_gradients = torch.autograd.grad(actor_loss, self._actor)
-        for parameters, gradients in (
-            (self._critic, critic_gradients),
-            (self._actor, actor_gradients),
-        ):
-            for parameter, gradient in zip(parameters, gradients, strict=True):
-                parameter.grad = gradient
-        self.log_temperature.grad = entropy - self.config.target_entropy * self.act_dim
+        Args:
+            batch: Transitions.
+            rng: Source of the actions that are drawn.
+            actor: Step the actor and the temperature too, not just the critics.
+        """
+        critic_loss = self._critic_loss(batch, self.noise(len(batch['rewards']), rng))
+        _set_gradients(self._critic, critic_loss)
+        scalars = {'critic_loss': critic_loss.detach()}
+        if actor:
+            scalars |= self._actor_gradients(batch['observations'], rng)
+        else:
+            for parameter in (*self._actor, self.log_temperature):
+                parameter.grad = None
         self.optimizer.step()
         with torch.no_grad():
             torch._foreach_lerp_(self._target, self._critic, self.config.tau)
-        return {
-            'critic_loss': critic_loss.detach(),
-            'value': values.detach().mean(),
-            'entropy': entropy,
-            'temperature': temperature,
-        }
+        return scalars
 
-    def set_lr(self, lr: float) -> None:
-        """Change the learning rate of everything."""
-        for group in self.optimizer.param_groups:
-            group['lr'] = lr
+    def scale_lr(self, share: float) -> None:
+        """Learn at this share of the learning rates of the settings."""
+        for group, full in zip(self.optimizer.param_groups, self._full_lr, strict=True):
+            group['lr'] = share * full
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything that a resumed run needs, by name."""
@@ -184,6 +192,19 @@ class SAC:
                 moments.setdefault(int(number), {})[name] = tensor
         self.optimizer.load_state_dict({**self.optimizer.state_dict(), 'state': moments})
 
+    def _actor_gradients(
+        self, observations: Tensor, rng: np.random.Generator
+    ) -> dict[str, Tensor]:
+        actions, log_probs = self._sample(observations, self.noise(len(observations), rng))
+        values = self._value(
+            self.critic, observations, actions, first=self.config.actor_critics == 'first'
+        )
+        temperature = self.log_temperature.detach().exp()
+        _set_gradients(self._actor, (temperature * log_probs - values).mean())
+        entropy = -log_probs.detach().mean()
+        self.log_temperature.grad = entropy - self.config.target_entropy * self.act_dim
+        return {'value': values.detach().mean(), 'entropy': entropy, 'temperature': temperature}
+
     def _critic_loss(self, batch: dict[str, Tensor], noise: Tensor) -> Tensor:
         with torch.no_grad():
             actions, log_probs = self._sample(batch['next_observations'], noise)
@@ -193,16 +214,26 @@ class SAC:
         inputs = torch.cat([batch['observations'], batch['actions']], dim=-1)
         return (self.critic(inputs).squeeze(-1) - targets).square().mean()
 
-    def _value(self, critic: StackedMLP, observations: Tensor, actions: Tensor) -> Tensor:
-        both = critic(torch.cat([observations, actions], dim=-1)).squeeze(-1)
+    def _value(
+        self, critic: StackedMLP, observations: Tensor, actions: Tensor, first: bool = False
+    ) -> Tensor:
+        copies = 1 if first else None
+        both = critic(torch.cat([observations, actions], dim=-1), copies).squeeze(-1)
         return both.amin(dim=0) if self.config.critics == 'min' else both.mean(dim=0)
 
     def _sample(self, observations: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """Actions (batch, act_dim) within -1 to 1 and their log densities (batch,)."""
         mean, log_std = self.actor(observations)[0].chunk(2, dim=-1)
-        log_std = log_std.clamp(*_LOG_STD_RANGE)
+        log_std = log_std.clamp(*self.config.log_std_range)
         raw = mean + log_std.exp() * noise
         # log(1 - tanh(u)^2) in the form that neither under- nor overflows.
         squashing = 2 * (math.log(2) - raw - functional.softplus(-2 * raw))
         log_prob = -0.5 * noise.square() - log_std - _HALF_LOG_TWO_PI - squashing
         return raw.tanh(), log_prob.sum(dim=-1)
+
+
+def _set_gradients(parameters: list[Tensor], loss: Tensor) -> None:
+    """Gradients of a loss for some parameters: no pass through weights for nothing."""
+    gradients = torch.autograd.grad(loss, parameters)
+    for parameter, gradient in zip(parameters, gradients, strict=True):
+        parameter.grad = gradient

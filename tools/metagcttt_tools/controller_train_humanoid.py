@@ -1,0 +1,72 @@
+"""Train the controller that walks the humanoid along a direction, which offline data needs."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from metagcttt_core.config import Settings
+from pydantic import Field
+from tqdm import tqdm
+
+from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.run_log import RunLog
+from metagcttt_tools.common.session import stop_on_signal, use_threads, write_settings
+from metagcttt_tools.controller.humanoid import HumanoidTraining
+from metagcttt_tools.controller.recipe import STAGES
+
+_DESCRIPTION = """Train the controller that walks the humanoid along a direction (SAC).
+
+Example: metagcttt controller train-humanoid --out out/humanoid-controller
+Three stages: to walk on a floor, to bear noise and pushes, to walk in mazes.
+Writes OUT/controller, OUT/checkpoint.safetensors (replay buffer included) and logs.
+Ctrl-C saves and ends; --resume goes on to the same end."""
+
+
+class TrainHumanoidSettings(Settings):
+    """Settings of the tool."""
+
+    out: Path = Field(Path('out/humanoid-controller'), description='folder of the run')
+    length: float = Field(1.0, gt=0, description='of each stage, as a share of the usual length')
+    seed: int = Field(0, ge=0, description='random seed')
+    checkpoint_every: int = Field(2500, ge=1, description='sweeps between checkpoints')
+    log_every: int = Field(250, ge=1, description='sweeps between log lines')
+    threads: int = Field(1, ge=1, description='threads for tensor operations')
+    resume: bool = Field(False, description='go on from the checkpoint in OUT, if there is one')
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run the tool."""
+    settings = parse(TrainHumanoidSettings, _DESCRIPTION, 'controller train-humanoid', argv)
+    use_threads(settings.threads)
+    try:
+        _run(settings)
+    except ValueError as error:
+        fail(str(error))
+
+
+def _run(settings: TrainHumanoidSettings) -> None:
+    stages = tuple(
+        replace(stage, sweeps=max(1, round(settings.length * stage.sweeps))) for stage in STAGES
+    )
+    training = HumanoidTraining(settings.out, settings.seed, stages)
+    if training.checkpoint.exists():
+        if not settings.resume:
+            fail(f'{training.checkpoint} exists: go on with --resume, or choose another --out')
+        training.restore()
+    write_settings(settings.out, settings)
+    first = training.sweep
+    with (
+        stop_on_signal() as stop,
+        RunLog(settings.out, first) as run_log,
+        tqdm(total=training.total, initial=first, unit='sweep', desc='humanoid') as bar,
+    ):
+
+        def log(sweep: int, scalars: dict[str, float]) -> None:
+            run_log.write(sweep, scalars)
+            bar.set_postfix(stage=training.stage.name, refresh=False)
+            bar.update(sweep - bar.n)
+
+        finished = training.run(log, stop.is_set, settings.log_every, settings.checkpoint_every)
+    if not finished:
+        print(f'stopped after sweep {training.sweep}; go on with --resume')
+        raise SystemExit(130)
+    print(f'controller: {settings.out / "controller"}')
