@@ -79,7 +79,7 @@ def test_report_message_tells_support_and_losses() -> None:
         milliseconds=1.5,
     )
     agent = make_agent('gcbc', obs_dim=2, act_dim=2, hidden=(4,))
-    adaptation = Adaptation(agent, [3.0, 2.0], [4.0, 3.5, 3.6], 1, True, '', 0.25)
+    adaptation = Adaptation(agent, [3.0, 2.0], [4.0, 3.5, 3.6], 1, seconds=0.25)
     message = report_message(
         to_time(0), query_id=3, episode_id=2, support=support, adaptation=adaptation
     )

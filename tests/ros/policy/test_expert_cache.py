@@ -9,7 +9,7 @@ HERE, GOAL = np.array([0.2, 9.0, 0.4]), np.array([5.1, 9.0, 5.2])
 
 
 def outcome(accepted: bool = True) -> Outcome:
-    return Outcome(None, Adaptation(object(), [], [], 3, accepted, '', 0.0))
+    return Outcome(None, Adaptation(object(), best_step=3 if accepted else 0))
 
 
 @pytest.fixture

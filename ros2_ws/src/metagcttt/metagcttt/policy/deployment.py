@@ -110,7 +110,7 @@ def answer_query(
     agent, trajectory_filter = deployment.agent, deployment.trajectory_filter
     if config.steps == 0:
         reason = 'adaptation is switched off (0 steps)'
-        return Outcome(None, Adaptation(agent, [], [], 0, False, reason, 0.0))
+        return Outcome(None, Adaptation(agent, reason=reason))
     steps_done = count()
 
     def stop_or_go_on() -> bool:
