@@ -319,5 +319,5 @@ def test_stop_is_heeded_before_the_critic_is_evaluated_any_further(
             deployed, np.zeros(2), goal, TTTConfig(steps=1), seed=0, should_stop=lambda: True
         )
     assert evaluated == []
-    deployment.foresee_values(deployed, goal, should_stop=lambda: False)
+    deployment.prefetch_values(deployed, goal, should_stop=lambda: False)
     assert sum(evaluated) == deployed.dataset.num_rows

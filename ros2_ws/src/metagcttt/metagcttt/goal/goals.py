@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sim_bridge import MazeDescription
 
-from metagcttt.vectors import vector_fault
+from metagcttt.input_checks import vector_fault
 
 Error = Literal[
     'NONE',

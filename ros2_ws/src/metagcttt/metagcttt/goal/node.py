@@ -5,6 +5,7 @@ from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 from metagcttt_core import TrajectoryDataset, TrajectoryFilter
+from metagcttt_core.config.assets import dataset_path
 from metagcttt_interfaces.action import ReachGoal
 from metagcttt_interfaces.msg import EpisodeEvent, MazeState, PolicyStatus
 import numpy as np
@@ -13,14 +14,14 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sim_bridge import describe_environment
 
-from metagcttt.assets import dataset_path
 from metagcttt.converters import feedback_message, to_array
 from metagcttt.diagnostics import Diagnostics
 from metagcttt.goal.goals import Goal, goal_ending, GoalCatalog, Verdict
 from metagcttt.goal.health import GoalMonitor
-from metagcttt.goal.publishers import GoalAnnouncer
+from metagcttt.goal.publishers import GoalPublishers
 from metagcttt.goal.reach_goal_server import ReachGoalServer
 from metagcttt.health import Health
+from metagcttt.input_checks import StateOrder, vector_fault
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import GOAL_NODE
 from metagcttt.qos import (
@@ -31,8 +32,6 @@ from metagcttt.qos import (
     RECORDED_DEPTH,
     state_profile,
 )
-from metagcttt.state_order import StateOrder
-from metagcttt.vectors import vector_fault
 
 WATCH_PERIOD_S = 0.1
 
@@ -70,7 +69,7 @@ class GoalNode(Node):
         self._goal: Goal | None = None
         self._num_accepted = 0
 
-        self._say = GoalAnnouncer(self, self._settings['frame_id'])
+        self._say = GoalPublishers(self, self._settings['frame_id'])
         profile = state_profile(self._settings['stepping'])
         if self._settings['stepping'] == 'lockstep':
             # The world waits for the policy, not for this node, which has to see every step.

@@ -20,7 +20,7 @@ ENDED = (EpisodeEvent.ENDED, 'ended')
 REPEATS_PER_LEASE = 4
 
 
-class GoalAnnouncer:
+class GoalPublishers:
     """Publishes `goal` and the goals' part of `episode`."""
 
     def __init__(self, node: Node, frame_id: str) -> None:

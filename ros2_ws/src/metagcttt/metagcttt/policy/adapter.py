@@ -8,11 +8,11 @@ from metagcttt_core.adaptation import AdaptationCancelled
 from rclpy.lifecycle import LifecycleNode
 
 from metagcttt.parameter_set import ParameterSet
-from metagcttt.policy.deployment import answer_query, Deployment, foresee_values, Outcome
+from metagcttt.policy.deployment import answer_query, Deployment, Outcome, prefetch_values
 from metagcttt.policy.expert_cache import ExpertCache
 from metagcttt.policy.health import PolicyMonitor
 from metagcttt.policy.pilot import Query, State
-from metagcttt.policy.publishers import PolicyAnnouncer
+from metagcttt.policy.publishers import PolicyPublishers
 from metagcttt.policy.worker import AdaptationWorker
 
 CANCELLED = 'cancelled by a newer goal, a newer episode or a stop'
@@ -31,7 +31,7 @@ class QueryAdapter:
         node: LifecycleNode,
         settings: ParameterSet,
         deployment: Deployment,
-        announcer: PolicyAnnouncer,
+        announcer: PolicyPublishers,
         monitor: PolicyMonitor,
         on_ended: Callable[[], None],
     ) -> None:
@@ -135,4 +135,4 @@ class QueryAdapter:
 
     def _foresee(self, query: Query) -> None:
         if query.config.horizon and self._deployment.agent.value_fn is not None:
-            self._worker.start(None, partial(foresee_values, self._deployment, query.goal))
+            self._worker.start(None, partial(prefetch_values, self._deployment, query.goal))

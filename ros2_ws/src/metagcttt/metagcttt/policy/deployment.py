@@ -16,11 +16,10 @@ from metagcttt_core import (
     TTTConfig,
 )
 from metagcttt_core.adaptation import AdaptationCancelled
+from metagcttt_core.config.assets import checkpoint_path, dataset_path
 from metagcttt_core.retrieval.value_cache import ValueFunction
 import numpy as np
 from numpy.typing import NDArray
-
-from metagcttt.assets import checkpoint_path, dataset_path
 
 
 @dataclass(frozen=True)
@@ -135,7 +134,7 @@ def answer_query(
     )
 
 
-def foresee_values(
+def prefetch_values(
     deployment: Deployment, goal: NDArray[np.float64], should_stop: Callable[[], bool]
 ) -> None:
     """Evaluate the critic towards `goal` everywhere, so that the next query of it is quick.
@@ -149,3 +148,17 @@ def foresee_values(
     assert value_fn is not None, 'policies without a critic have nothing to foresee'
     remembered = _StoppableValue(value_fn, should_stop=lambda: False)
     deployment.trajectory_filter.prefetch_values(remembered, goal, should_stop)
+
+
+def warm_up(deployment: Deployment) -> None:
+    """Take one gradient step and discard it; policy and dataset are not changed.
+
+    PyTorch imports and initialises for a second or two at the first step, which would stall the
+    control loop.
+    """
+    observation = np.asarray(deployment.dataset.observations[0], dtype=np.float64)
+    agent, trajectory_filter = deployment.agent, deployment.trajectory_filter
+    support = trajectory_filter.query(observation, observation, agent.value_fn)
+    config = TTTConfig(steps=1, batch_size=2)
+    adapt(agent, deployment.dataset, support, observation, config)
+    agent.act(observation, observation)

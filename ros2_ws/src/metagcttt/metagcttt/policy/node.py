@@ -13,9 +13,8 @@ from metagcttt.diagnostics import Diagnostics
 from metagcttt.health import Health, Level
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import POLICY_NODE
-from metagcttt.policy.deployment import load_deployment
+from metagcttt.policy.deployment import load_deployment, warm_up
 from metagcttt.policy.session import PolicySession
-from metagcttt.policy.warm_up import warm_up
 
 
 class PolicyNode(LifecycleNode):

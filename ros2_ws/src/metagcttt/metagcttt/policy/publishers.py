@@ -15,7 +15,7 @@ from metagcttt.qos import COMMAND, EVENTS, keep_several, LATCHED, RECORDED_DEPTH
 STATUS_PERIOD_S = 0.2
 
 
-class PolicyAnnouncer:
+class PolicyPublishers:
     """Publishes `action`, `adaptation` and `policy_status` while the node is active."""
 
     def __init__(self, node: LifecycleNode, instance: int) -> None:

@@ -1,7 +1,7 @@
 """When a policy has to keep the robot still. No ROS in here."""
 
+from metagcttt.input_checks import Senders
 from metagcttt.policy.pilot import State
-from metagcttt.senders import Senders
 
 
 class Safety:
@@ -40,7 +40,7 @@ class Safety:
         self._lease_s = lease_s
         self._lease_end_s = now_s + lease_s if lease_s > 0 else float('inf')
 
-    def lose_goal(self, query_id: int, now_s: float) -> bool:
+    def expire_goal(self, query_id: int, now_s: float) -> bool:
         """Whether the goal in force is no longer repeated, as its node is gone."""
         if now_s <= self._lease_end_s:
             return False

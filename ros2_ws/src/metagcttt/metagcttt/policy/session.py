@@ -11,16 +11,15 @@ from rclpy.timer import Timer
 
 from metagcttt.converters import to_array
 from metagcttt.health import Health
+from metagcttt.input_checks import StateOrder, vector_fault
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.policy.adapter import QueryAdapter
 from metagcttt.policy.deployment import Deployment
 from metagcttt.policy.health import Limits, PolicyMonitor
 from metagcttt.policy.pilot import choose, Query, State
-from metagcttt.policy.publishers import PolicyAnnouncer
+from metagcttt.policy.publishers import PolicyPublishers
 from metagcttt.policy.safety import Safety
 from metagcttt.qos import LATCHED, state_profile
-from metagcttt.state_order import StateOrder
-from metagcttt.vectors import vector_fault
 
 WARNING_PERIOD_S = 5.0
 WATCH_PERIOD_S = 0.1
@@ -67,7 +66,7 @@ class PolicySession:
         self._order = StateOrder()
         self._monitor = PolicyMonitor()
         self._safety = Safety(enabled=enabled)
-        self._say = PolicyAnnouncer(node, instance)
+        self._say = PolicyPublishers(node, instance)
         self._adapter = QueryAdapter(
             node, settings, deployment, self._say, self._monitor, self._proceed
         )
@@ -165,7 +164,7 @@ class PolicySession:
 
     def _on_status(self, message: PolicyStatus) -> None:
         if message.instance != self._instance:
-            self._safety.rivals.hear(message.instance, time.monotonic())
+            self._safety.rivals.saw(message.instance, time.monotonic())
 
     def _on_goal(self, message: GoalQuery) -> None:
         self._safety.saw_goal(time.monotonic(), message.lease_s if message.active else 0.0)
@@ -226,7 +225,7 @@ class PolicySession:
         """Look after what may stop coming; not by the node's clock, which may stand still."""
         now_s = time.monotonic()
         query = self._query
-        if query is not None and self._safety.lose_goal(query.query_id, now_s):
+        if query is not None and self._safety.expire_goal(query.query_id, now_s):
             self._node.get_logger().error(self._safety.lost_goal)
             self._adapter.cancel()
             self._query = self._goal_message = None

@@ -3,7 +3,7 @@
 import time
 
 from metagcttt.health import Faults, Health, Level, Rate
-from metagcttt.senders import Senders
+from metagcttt.input_checks import Senders
 
 
 class SimMonitor:
@@ -24,7 +24,7 @@ class SimMonitor:
             instance: Number of its sender.
         """
         now_s = time.monotonic()
-        self._senders.hear(instance, now_s)
+        self._senders.saw(instance, now_s)
         self.actions.add(now_s)
         if fault:
             self.faults.note('malformed_actions', fault, now_s)

@@ -28,6 +28,7 @@ from metagcttt.converters import (
 )
 from metagcttt.diagnostics import Diagnostics
 from metagcttt.health import Health
+from metagcttt.input_checks import vector_fault
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import SIM_BRIDGE_NODE
 from metagcttt.qos import (
@@ -41,7 +42,6 @@ from metagcttt.qos import (
 )
 from metagcttt.sim.health import SimMonitor
 from metagcttt.sim.pacing import Pacer
-from metagcttt.vectors import vector_fault
 
 HEARTBEAT_S = 0.1
 

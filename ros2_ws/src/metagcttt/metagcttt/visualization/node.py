@@ -5,6 +5,7 @@ import math
 from typing import Any
 
 from metagcttt_core import load_checkpoint, TrajectoryDataset
+from metagcttt_core.config.assets import checkpoint_path, dataset_path
 from metagcttt_interfaces.msg import AdaptationReport, GoalQuery, MazeState
 from nav_msgs.msg import Odometry, Path
 import numpy as np
@@ -15,7 +16,6 @@ from sim_bridge import describe_environment
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
-from metagcttt.assets import checkpoint_path, dataset_path
 from metagcttt.converters import to_array
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import VISUALIZATION_NODE
