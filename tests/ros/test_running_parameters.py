@@ -89,7 +89,7 @@ def test_next_goal_is_waited_for(
     assert not rig.action_for(0).adapted
     change(rig.node, adaptation='hold')
     rig.goal(2)
-    rig.graph.wait(lambda: rig.session._query.query_id == 2, 'the second goal')
+    rig.graph.wait(lambda: rig.session._pursuit.goal.query_id == 2, 'the second goal')
     rig.wait_until_adapting()
     rig.state(step=1)
     rig.graph.wait(lambda: rig.session._state.step == 1, 'the state')

@@ -1,4 +1,4 @@
-from metagcttt.policy.pilot import State
+from metagcttt.policy.decision import State
 from metagcttt.policy.safety import Safety
 import numpy as np
 

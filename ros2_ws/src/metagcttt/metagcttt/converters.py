@@ -7,14 +7,15 @@ import math
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point
 from metagcttt_interfaces.action import ReachGoal
-from metagcttt_interfaces.msg import ActionCommand, MazeState, PolicyStatus
+from metagcttt_interfaces.msg import ActionCommand, GoalQuery, MazeState, PolicyStatus
 from nav_msgs.msg import OccupancyGrid
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sim_bridge import MazeMap
 from std_msgs.msg import Header
 
-from metagcttt.goal.goals import Goal
+from metagcttt.goal.goals import Goal as AcceptedGoal
+from metagcttt.goal_in_force import Goal
 
 OCCUPIED = 100
 FREE = 0
@@ -90,7 +91,9 @@ def action_message(
     )
 
 
-def feedback_message(goal: Goal, state: MazeState, policy: PolicyStatus) -> ReachGoal.Feedback:
+def feedback_message(
+    goal: AcceptedGoal, state: MazeState, policy: PolicyStatus
+) -> ReachGoal.Feedback:
     """How far a goal is: by the newest state and by what the policy last said of itself."""
     xy = (state.position.x, state.position.y)
     feedback = ReachGoal.Feedback(
@@ -107,6 +110,31 @@ def feedback_message(goal: Goal, state: MazeState, policy: PolicyStatus) -> Reac
         feedback.adapt_steps = policy.steps
         feedback.adapted = policy.adapted
     return feedback
+
+
+def goal_message(header: Header, goal: Goal, *, active: bool, lease_s: float = 0.0) -> GoalQuery:
+    """A goal for the policy to act on, or that is over."""
+    return GoalQuery(
+        header=header,
+        query_id=goal.query_id,
+        episode_id=goal.episode_id,
+        active=active,
+        goal=to_floats(goal.observation),
+        position=to_point(goal.xy),
+        seed=goal.seed,
+        lease_s=lease_s,
+    )
+
+
+def to_goal(message: GoalQuery) -> Goal:
+    """The goal of a message."""
+    return Goal(
+        query_id=message.query_id,
+        episode_id=message.episode_id,
+        observation=to_array(message.goal),
+        xy=(message.position.x, message.position.y),
+        seed=message.seed,
+    )
 
 
 def occupancy_grid(maze: MazeMap, header: Header) -> OccupancyGrid:

@@ -1,4 +1,4 @@
-"""The lifecycle of the policy; what it does while active is in `policy_session`."""
+"""The policy node and its lifecycle; `session` has its behaviour while configured."""
 
 import secrets
 from typing import Any
@@ -35,7 +35,7 @@ class PolicyNode(LifecycleNode):
         )
         self.add_post_set_parameters_callback(self._on_parameters_set)
         self.create_service(SetBool, 'enable', self._on_enable)
-        self._failure = ''  # of the newest configuration
+        self._failure = ''  # of the latest configuration
         self._diagnostics = Diagnostics(
             self, self._examine, self._settings['diagnostics_period_s']
         )
@@ -63,7 +63,7 @@ class PolicyNode(LifecycleNode):
             )
             warm_up(deployment)
         except (OSError, ValueError) as error:
-            # rclpy would swallow it without a word.
+            # rclpy would swallow it silently.
             self._failure = f'cannot configure: {error}'
             self.get_logger().error(self._failure)
             return TransitionCallbackReturn.FAILURE
