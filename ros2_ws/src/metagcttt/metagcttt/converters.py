@@ -1,20 +1,17 @@
-"""Between messages and arrays. Pure functions; no node is needed to use them."""
+"""Conversions between messages and arrays, as pure functions."""
 
 from array import array
 from collections.abc import Iterable, Sequence
-import math
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point
-from metagcttt_interfaces.action import ReachGoal
-from metagcttt_interfaces.msg import ActionCommand, GoalQuery, MazeState, PolicyStatus
+from metagcttt_interfaces.msg import ActionCommand, GoalQuery, MazeState
 from nav_msgs.msg import OccupancyGrid
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sim_bridge import MazeMap
 from std_msgs.msg import Header
 
-from metagcttt.goal.goals import Goal as AcceptedGoal
 from metagcttt.goal_in_force import Goal
 
 OCCUPIED = 100
@@ -89,27 +86,6 @@ def action_message(
         adapted=bool(adapted),
         instance=instance,
     )
-
-
-def feedback_message(
-    goal: AcceptedGoal, state: MazeState, policy: PolicyStatus
-) -> ReachGoal.Feedback:
-    """How far a goal is: by the newest state and by what the policy last said of itself."""
-    xy = (state.position.x, state.position.y)
-    feedback = ReachGoal.Feedback(
-        phase=ReachGoal.Feedback.WAITING,
-        distance_m=math.dist(xy, goal.xy),
-        steps=max(state.step - goal.first_step, 0) if state.episode_id == goal.episode_id else 0,
-    )
-    if policy.query_id == goal.query_id:
-        feedback.phase = {
-            PolicyStatus.ADAPTING: ReachGoal.Feedback.ADAPTING,
-            PolicyStatus.ACTING: ReachGoal.Feedback.DRIVING,
-        }.get(policy.phase, ReachGoal.Feedback.WAITING)
-        feedback.adapt_steps_done = policy.steps_done
-        feedback.adapt_steps = policy.steps
-        feedback.adapted = policy.adapted
-    return feedback
 
 
 def goal_message(header: Header, goal: Goal, *, active: bool, lease_s: float = 0.0) -> GoalQuery:
