@@ -39,7 +39,7 @@ def test_simulator_reports_what_it_does_with_actions(graph: Graph, make_rig) -> 
     rig.diagnosed(OK, 'stepping', '/sim_bridge_node')
     act(float('nan'))
     rig.diagnosed(ERROR, 'an action was ignored: the action is not finite', '/sim_bridge_node')
-    rig.diagnosed(WARN, 'the action is zero: none has come lately', '/sim_bridge_node')
+    rig.diagnosed(WARN, 'the action is zero: none was received recently', '/sim_bridge_node')
     act(0.0)
     rig.diagnosed(OK, 'stepping', '/sim_bridge_node')
     graph.node.destroy_publisher(actions)

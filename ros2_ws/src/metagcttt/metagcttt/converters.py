@@ -19,7 +19,7 @@ FREE = 0
 
 
 def to_floats(values: ArrayLike) -> 'array[float]':
-    """Numbers of shape (n,) as what a float64[] field takes fastest."""
+    """Numbers of shape (n,) in the type that a float64[] field takes fastest."""
     floats = array('d')
     floats.frombytes(np.ascontiguousarray(values, dtype=np.float64).tobytes())
     return floats
@@ -37,7 +37,7 @@ def to_point(xy: Iterable[float]) -> Point:
 
 
 def to_time(nanoseconds: int) -> Time:
-    """Nanoseconds as a stamp."""
+    """A time stamp from nanoseconds."""
     seconds, rest = divmod(nanoseconds, 10**9)
     return Time(sec=seconds, nanosec=rest)
 
@@ -53,7 +53,7 @@ def state_message(
     truncated: bool,
     success: bool,
 ) -> MazeState:
-    """What the simulator publishes after one control step."""
+    """The state after a control step."""
     return MazeState(
         header=header,
         episode_id=episode_id,
@@ -76,7 +76,7 @@ def action_message(
     adapted: bool,
     instance: int = 0,
 ) -> ActionCommand:
-    """The answer of the policy to one state."""
+    """The action for a state."""
     return ActionCommand(
         header=Header(stamp=stamp),
         episode_id=episode_id,
@@ -114,7 +114,7 @@ def to_goal(message: GoalQuery) -> Goal:
 
 
 def occupancy_grid(maze: MazeMap, header: Header) -> OccupancyGrid:
-    """A maze as a map of its cells, whose origin is the lower left corner of cell (0, 0)."""
+    """The occupancy grid of a maze; its origin is the lower left corner of cell (0, 0)."""
     grid = OccupancyGrid(header=header)
     xmin, _, ymin, _ = maze.extent
     rows, cols = maze.walls.shape

@@ -47,7 +47,7 @@ class Pursuit:
     Attributes:
         goal: The goal.
         config: Inner loop for this goal.
-        hold: Whether to wait for the expert instead of acting with the weights in hand.
+        hold: Whether to wait for the expert instead of acting with the current weights.
         adaptation: The newest one; its agent acts. At first the base policy, with the reason.
         adapting: Whether an adaptation is under way.
         adapted_at: Control step of the state that was last adapted to.

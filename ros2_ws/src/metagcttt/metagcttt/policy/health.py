@@ -1,25 +1,9 @@
 """Policy health."""
 
-from dataclasses import dataclass
 import time
 
 from metagcttt.health import Deadlines, Faults, Health, Level, Rate, Samples
 from metagcttt.policy.decision import Pursuit
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Thresholds above which a policy counts as degraded.
-
-    Attributes:
-        latency_ms: Of the 99th percentile of the time from a state's arrival to its action.
-        missed_deadlines: Control periods without an action in the last minute.
-        adapt_ms: Time that the last adaptation took.
-    """
-
-    latency_ms: float
-    missed_deadlines: int
-    adapt_ms: float
 
 
 class PolicyMonitor:
@@ -42,7 +26,9 @@ class PolicyMonitor:
         pursuit: Pursuit | None,
         num_publishers: int,
         num_pending: int,
-        limits: Limits,
+        warn_latency_ms: float,
+        warn_missed_deadlines: int,
+        warn_adapt_ms: float,
     ) -> Health:
         """The current health.
 
@@ -52,7 +38,9 @@ class PolicyMonitor:
             pursuit: The work on the goal in force, if there is one.
             num_publishers: Publishers of actions in the graph, this one included.
             num_pending: Jobs whose result was not handled yet.
-            limits: Thresholds of a degraded policy.
+            warn_latency_ms: Threshold of the 99th percentile of the time from state to action.
+            warn_missed_deadlines: Threshold of control periods missed in the last minute.
+            warn_adapt_ms: Threshold of the duration of the last adaptation.
         """
         now_s = time.monotonic()
         missed = self.deadlines.in_last_minute(now_s)
@@ -80,11 +68,11 @@ class PolicyMonitor:
             level, message = Level.ERROR, f'just now: {recent}'
         elif num_publishers > 1:
             level, message = Level.WARN, f'{num_publishers} nodes publish actions'
-        elif latency_ms > limits.latency_ms:
+        elif latency_ms > warn_latency_ms:
             level, message = Level.WARN, f'99 % of actions within {latency_ms:.1f} ms only'
-        elif missed > limits.missed_deadlines:
+        elif missed > warn_missed_deadlines:
             level, message = Level.WARN, f'{missed} deadlines missed in the last minute'
-        elif self.adapt_ms.last() > limits.adapt_ms:
+        elif self.adapt_ms.last() > warn_adapt_ms:
             level, message = Level.WARN, f'the adaptation took {self.adapt_ms.last():.0f} ms'
         elif pursuit is None:
             message = 'no goal'

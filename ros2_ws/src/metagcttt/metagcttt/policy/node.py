@@ -95,14 +95,11 @@ class PolicyNode(LifecycleNode):
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Disconnect and free the policy and the dataset."""
+        """Close the session, which frees the policy and the dataset."""
         self._close_session()
         return TransitionCallbackReturn.SUCCESS
 
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop and free everything, for good."""
-        self._close_session()
-        return TransitionCallbackReturn.SUCCESS
+    on_shutdown = on_cleanup
 
     def _close_session(self) -> None:
         if self._session is not None:

@@ -30,10 +30,6 @@ class Safety:
         """
         self._state_s, self._state_clock_s = now_s, clock_s
 
-    def state_age_s(self, now_s: float, clock_s: float) -> float:
-        """Seconds since the newest state, by whichever clock shows more."""
-        return max(now_s - self._state_s, clock_s - self._state_clock_s)
-
     def saw_goal(self, now_s: float, lease_s: float) -> None:
         """Record a goal or its repetition; it expires `lease_s` later, never with 0."""
         self.expired_goal = ''
@@ -60,7 +56,7 @@ class Safety:
             clock_s: See `saw_state`.
             timeout_s: Oldest age of a state to act on, seconds.
         """
-        age_s = self.state_age_s(now_s, clock_s)
+        age_s = max(now_s - self._state_s, clock_s - self._state_clock_s)
         if not self.enabled:
             return 'disabled by the service enable'
         if self.rivals.count(now_s):

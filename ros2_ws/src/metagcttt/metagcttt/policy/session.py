@@ -16,7 +16,7 @@ from metagcttt.parameter_set import ParameterSet
 from metagcttt.policy.adapter import GoalAdapter
 from metagcttt.policy.decision import decide, Pursuit, State
 from metagcttt.policy.deployment import Deployment
-from metagcttt.policy.health import Limits, PolicyMonitor
+from metagcttt.policy.health import PolicyMonitor
 from metagcttt.policy.publishers import PolicyPublishers
 from metagcttt.policy.safety import Safety
 from metagcttt.qos import LATCHED, state_profile
@@ -286,9 +286,7 @@ class PolicySession:
             pursuit=self._pursuit,
             num_publishers=self._node.count_publishers('action'),
             num_pending=self._adapter.num_pending,
-            limits=Limits(
-                latency_ms=self._settings['warn_latency_ms'],
-                missed_deadlines=self._settings['warn_missed_deadlines'],
-                adapt_ms=self._settings['warn_adapt_ms'],
-            ),
+            warn_latency_ms=self._settings['warn_latency_ms'],
+            warn_missed_deadlines=self._settings['warn_missed_deadlines'],
+            warn_adapt_ms=self._settings['warn_adapt_ms'],
         )
