@@ -248,11 +248,11 @@ class SentGoal:
 
     @property
     def accepted(self) -> bool:
-        """Whether the goal node accepted it."""
+        """True when the goal node accepted it."""
         return self._handle is not None
 
     def is_done(self) -> bool:
-        """Whether the result is known; handles waiting messages first.
+        """True when the result is known; handles waiting messages first.
 
         Raises:
             GoalLostError: If the goal node has become silent.
@@ -296,7 +296,7 @@ class SentGoal:
         self._result = result
 
     def _is_known(self) -> bool:
-        """Whether the result is known; raises when the goal node is silent."""
+        """True when the result is known; raises when the goal node is silent."""
         now_s = time.monotonic()
         if now_s - self._looked_s > SILENT_S / 2:
             self._heard_s = now_s  # nothing was spun meanwhile

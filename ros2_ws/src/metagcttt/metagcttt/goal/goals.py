@@ -140,7 +140,7 @@ class GoalCatalog:
 def goal_ending(
     goal: AcceptedGoal, state: RobotState, *, tolerance_m: float, max_steps: int
 ) -> Verdict | None:
-    """How a goal ends in a state of its episode; None while it is under way.
+    """The ending of a goal in a state of its episode; None while it is under way.
 
     Args:
         goal: The goal.

@@ -122,7 +122,7 @@ class GoalNode(Node):
         )
 
     def _is_acceptable(self, message: ReachGoal.Goal) -> bool:
-        """Whether an action goal can be accepted; publishes the reason if not."""
+        """Check an action goal, and publish the reason if it cannot be accepted."""
         request = self._to_request(message)
         refusal = self._tracker.refusal(request)
         if refusal is not None:

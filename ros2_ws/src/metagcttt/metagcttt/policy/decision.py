@@ -63,11 +63,11 @@ class Pursuit:
     progress: Progress = field(default_factory=Progress)
 
     def serves(self, state: State) -> bool:
-        """Whether the goal counts in `state`."""
+        """True when the goal counts in `state`."""
         return state.episode_id == self.goal.episode_id and not state.ended
 
     def needs_adaptation(self, state: State) -> bool:
-        """Whether to adapt to `state`: the first one, or `horizon` steps after the last time."""
+        """True when an adaptation is due: the first, or `horizon` steps after the last."""
         if self.adapting or state.fault or not self.serves(state):
             return False
         if self.adapted_at is None:

@@ -37,7 +37,7 @@ class Safety:
         self._lease_end_s = now_s + lease_s if lease_s > 0 else float('inf')
 
     def expire_goal(self, query_id: int, now_s: float) -> bool:
-        """Whether the lease of the goal in force has run out; notes the reason."""
+        """Drop the goal in force, for the reason kept, and return true if its lease ran out."""
         if now_s <= self._lease_end_s:
             return False
         self.expired_goal = (
