@@ -43,5 +43,5 @@ class Adaptation:
 
     @property
     def accepted(self) -> bool:
-        """Whether `agent` has adapted weights."""
+        """True when `agent` has adapted weights."""
         return self.best_step > 0
