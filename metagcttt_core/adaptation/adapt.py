@@ -1,7 +1,7 @@
 """Test-time training: from a base policy to the expert for one query (paper, section 3.2)."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 import time
 
 import numpy as np
@@ -10,32 +10,10 @@ import torch
 from metagcttt_core.adaptation.batches import QueryBatches
 from metagcttt_core.adaptation.config import TTTConfig
 from metagcttt_core.adaptation.inner_loop import run_inner_loop
+from metagcttt_core.adaptation.result import Adaptation, OnStep
 from metagcttt_core.agents.agent import Agent
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.retrieval.support import SupportSet
-
-
-@dataclass(frozen=True)
-class Adaptation:
-    """The outcome of adapting to one query.
-
-    Attributes:
-        agent: The expert; the base agent itself when not accepted.
-        train_losses: Loss of each step's batch before the step.
-        test_losses: Held-out loss after 0..K steps, with early stopping.
-        best_step: Number of gradient steps behind `agent`'s weights.
-        accepted: Whether `agent` differs from the base agent.
-        reason: Why it was not accepted; empty if it was.
-        seconds: Time it took.
-    """
-
-    agent: Agent
-    train_losses: list[float]
-    test_losses: list[float]
-    best_step: int
-    accepted: bool
-    reason: str
-    seconds: float
 
 
 def adapt(
@@ -48,6 +26,7 @@ def adapt(
     *,
     optimizer_state: dict | None = None,
     should_stop: Callable[[], bool] | None = None,
+    on_step: OnStep | None = None,
 ) -> Adaptation:
     """Take K steps on the support set, with the actor's goal fixed to the query's goal.
 
@@ -61,6 +40,7 @@ def adapt(
         optimizer_state: The pre-trained optimiser state, for
             `config.optimizer_state='pretrained'`.
         should_stop: Asked before every gradient step; true cancels.
+        on_step: Called after every gradient step, with the losses by part.
 
     Returns:
         The expert and its losses. An empty support, zero steps, weights that became non-finite or,
@@ -74,12 +54,15 @@ def adapt(
     began = time.perf_counter()
     _check(agent, dataset, goal, config, optimizer_state)
 
-    def base(reason: str, test_losses: list[float], train_losses: list[float]) -> Adaptation:
-        seconds = time.perf_counter() - began
-        return Adaptation(agent, train_losses, test_losses, 0, False, reason, seconds)
+    def ended(result: Adaptation) -> Adaptation:
+        return replace(result, support=support, seconds=time.perf_counter() - began)
+
+    def base(reason: str, result: Adaptation | None = None) -> Adaptation:
+        result = result or Adaptation(agent)
+        return ended(replace(result, agent=agent, best_step=0, reason=reason))
 
     if config.steps == 0:
-        return base('no adaptation steps were asked for', [], [])
+        return base('no adaptation steps were asked for')
     split_seed, batch_seed = np.random.SeedSequence(seed).spawn(2)
     rng = np.random.default_rng(batch_seed)
     train, test = support, None
@@ -100,12 +83,12 @@ def adapt(
 
     train_batches = batches_of(train)
     if not len(train_batches.rows):
-        return base('the filtered dataset is empty', [], [])
+        return base('the filtered dataset is empty')
     test_batch = None
     if test is not None:
         test_batches = batches_of(test)
         if not len(test_batches.rows):
-            return base('the filtered dataset is too small to hold out a test split', [], [])
+            return base('the filtered dataset is too small to hold out a test split')
         test_batch = test_batches.all(rng)
     state = optimizer_state if config.optimizer_state == 'pretrained' else None
     result = run_inner_loop(
@@ -117,22 +100,13 @@ def adapt(
         test_batch=test_batch,
         actor_only=config.actor_only,
         should_stop=should_stop,
+        on_step=on_step,
     )
     if result.best_step == 0:
-        return base(
-            'the held-out loss never fell below its start', result.test_losses, result.train_losses
-        )
+        return base('the held-out loss never fell below its start', result)
     if not all(torch.isfinite(weight).all() for weight in result.agent.parameters()):
-        return base('the adapted weights are not finite', result.test_losses, result.train_losses)
-    return Adaptation(
-        agent=result.agent,
-        train_losses=result.train_losses,
-        test_losses=result.test_losses,
-        best_step=result.best_step,
-        accepted=True,
-        reason='',
-        seconds=time.perf_counter() - began,
-    )
+        return base('the adapted weights are not finite', result)
+    return ended(result)
 
 
 def _check(

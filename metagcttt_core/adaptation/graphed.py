@@ -6,7 +6,8 @@ import itertools
 import torch
 from torch import Tensor
 
-from metagcttt_core.adaptation.inner_loop import BestStep, copy_weights, InnerLoopResult
+from metagcttt_core.adaptation.inner_loop import BestStep, copy_weights
+from metagcttt_core.adaptation.result import Adaptation
 from metagcttt_core.agents.agent import Agent, TensorBatch
 from metagcttt_core.training.optimizers import make_optimizer, OptimizerName
 from metagcttt_core.training.step import gradient_step
@@ -43,7 +44,7 @@ class GraphedInnerLoop:
 
     def __call__(
         self, base: Agent, batches: Iterable[TensorBatch], *, test_batch: TensorBatch | None = None
-    ) -> InnerLoopResult:
+    ) -> Adaptation:
         """Adapt a copy of `base`, one gradient step per batch, from a fresh optimiser state."""
         remaining = iter(batches)
         first = next(remaining)
@@ -63,7 +64,7 @@ class GraphedInnerLoop:
             best.restore()
         expert = base.clone()
         copy_weights(self._agent, expert)
-        return InnerLoopResult(
+        return Adaptation(
             agent=expert,
             train_losses=torch.stack(losses).tolist(),
             test_losses=[] if best is None else best.losses,

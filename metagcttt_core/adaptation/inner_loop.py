@@ -1,36 +1,15 @@
 """The inner loop U^K: gradient steps from base weights to expert weights (paper, equation 5)."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 import math
 from typing import Any
 
 import torch
 
+from metagcttt_core.adaptation.result import Adaptation, AdaptationCancelled, OnStep
 from metagcttt_core.agents.agent import Agent, TensorBatch
 from metagcttt_core.training.optimizers import make_optimizer, OptimizerName
 from metagcttt_core.training.step import gradient_step
-
-
-class AdaptationCancelled(Exception):
-    """The caller asked an adaptation to stop before its end."""
-
-
-@dataclass(frozen=True)
-class InnerLoopResult:
-    """The expert and how it came about.
-
-    Attributes:
-        agent: The copy of the base agent with the weights of the best step.
-        train_losses: (K,) loss of each step's batch before the step.
-        test_losses: (K + 1,) loss of the test batch after 0..K steps; empty without a test batch.
-        best_step: k* (paper, equation 9): the step whose weights `agent` has.
-    """
-
-    agent: Agent
-    train_losses: list[float]
-    test_losses: list[float]
-    best_step: int
 
 
 def run_inner_loop(
@@ -43,7 +22,8 @@ def run_inner_loop(
     test_batch: TensorBatch | None = None,
     actor_only: bool = False,
     should_stop: Callable[[], bool] | None = None,
-) -> InnerLoopResult:
+    on_step: OnStep | None = None,
+) -> Adaptation:
     """Adapt a copy of `base`, one gradient step per batch; `base` is not changed.
 
     Args:
@@ -57,6 +37,7 @@ def run_inner_loop(
             non-finite loss never wins.
         actor_only: Train the actor and leave the rest.
         should_stop: Asked before every step.
+        on_step: Called after every step.
 
     Raises:
         AdaptationCancelled: When `should_stop` returned true.
@@ -69,14 +50,16 @@ def run_inner_loop(
     for step, batch in enumerate(batches, start=1):
         if should_stop is not None and should_stop():
             raise AdaptationCancelled(f'cancelled before inner step {step}')
-        loss, _ = gradient_step(agent, stepper, parameters, batch, actor_only=actor_only)
+        loss, parts = gradient_step(agent, stepper, parameters, batch, actor_only=actor_only)
         train_losses.append(loss)
+        if on_step is not None:
+            on_step(step, {'total': loss, **parts})
         if best is not None:
             best.test(step)
     stepper.zero_grad()
     if best is not None:
         best.restore()
-    return InnerLoopResult(
+    return Adaptation(
         agent=agent,
         train_losses=torch.stack(train_losses).tolist() if train_losses else [],
         test_losses=[] if best is None else best.losses,

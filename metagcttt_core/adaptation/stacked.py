@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.func import functional_call, vmap
 
 from metagcttt_core.adaptation.functional import AgentLoss
-from metagcttt_core.adaptation.inner_loop import InnerLoopResult
+from metagcttt_core.adaptation.result import Adaptation
 from metagcttt_core.agents.agent import Agent, TensorBatch
 from metagcttt_core.training.optimizers import make_optimizer, OptimizerName
 
@@ -20,7 +20,7 @@ def run_inner_loops(
     lr: float,
     optimizer: OptimizerName = 'adam',
     actor_only: bool = False,
-) -> list[InnerLoopResult]:
+) -> list[Adaptation]:
     """What `run_inner_loop` returns for each task, to float tolerance, adapted together.
 
     Adam and gradient descent treat every weight on its own, so one optimiser over stacked weights
@@ -54,11 +54,11 @@ def run_inner_loops(
     if best is None:
         last = len(train_losses)
         return [
-            InnerLoopResult(stack.copy_into(base, stack.weights, task), losses, [], last)
+            Adaptation(stack.copy_into(base, stack.weights, task), losses, [], last)
             for task, losses in enumerate(by_task)
         ]
     return [
-        InnerLoopResult(
+        Adaptation(
             stack.copy_into(base, best.weights, task),
             losses,
             [tested[task] for tested in best.losses],

@@ -1,7 +1,9 @@
-"""Location of the committed checkpoints and datasets."""
+"""Paths of the committed checkpoints and datasets."""
 
 import os
 from pathlib import Path
+
+_COMMITTED = 'pointmaze-medium-navigate'
 
 
 def assets_dir() -> Path:
@@ -20,3 +22,13 @@ def assets_dir() -> Path:
             'or set METAGCTTT_ASSETS to the assets folder'
         )
     return folder
+
+
+def checkpoint_path(path: str = '') -> Path:
+    """`path` with `~` expanded, or the committed post-trained policy when it is empty."""
+    return Path(path).expanduser() if path else assets_dir() / _COMMITTED / 'meta'
+
+
+def dataset_path(path: str = '') -> Path:
+    """`path` with `~` expanded, or the committed dataset when it is empty."""
+    return Path(path).expanduser() if path else assets_dir() / _COMMITTED / 'dataset.npz'

@@ -10,7 +10,8 @@ import torch
 
 from metagcttt_core.adaptation.batches import QueryBatches
 from metagcttt_core.adaptation.graphed import GraphedInnerLoop
-from metagcttt_core.adaptation.inner_loop import InnerLoopResult, run_inner_loop
+from metagcttt_core.adaptation.inner_loop import run_inner_loop
+from metagcttt_core.adaptation.result import Adaptation
 from metagcttt_core.adaptation.stacked import run_inner_loops
 from metagcttt_core.agents.agent import Agent, TensorBatch
 from metagcttt_core.data.dataset import TrajectoryDataset
@@ -24,7 +25,7 @@ _LARGEST_STACKED_ON_CPU = 2_000_000
 
 
 InnerLoops = Callable[
-    [Agent, Sequence[Iterable[TensorBatch]], Sequence[TensorBatch] | None], list[InnerLoopResult]
+    [Agent, Sequence[Iterable[TensorBatch]], Sequence[TensorBatch] | None], list[Adaptation]
 ]
 """From a base agent and, by task, train batches and test batches (if any) to the results."""
 
@@ -39,7 +40,7 @@ class Expert:
         train_batches: Draws the batches of the inner steps once more.
     """
 
-    result: InnerLoopResult
+    result: Adaptation
     test_batch: TensorBatch
     train_batches: Callable[[], Iterable[TensorBatch]]
 
@@ -95,7 +96,7 @@ def make_inner_loops(
     optimizer, lr, actor_only = config.optimizer, config.inner_lr, config.actor_only
     if adapts_together(base, config) if together is None else together:
         return partial(run_inner_loops, lr=lr, optimizer=optimizer, actor_only=actor_only)
-    inner_loop: Callable[..., InnerLoopResult]
+    inner_loop: Callable[..., Adaptation]
     if base.device.type == 'cuda' and cuda_graphs:
         inner_loop = GraphedInnerLoop(base, lr=lr, optimizer=optimizer, actor_only=actor_only)
     else:
@@ -105,7 +106,7 @@ def make_inner_loops(
         base: Agent,
         batches: Sequence[Iterable[TensorBatch]],
         test_batches: Sequence[TensorBatch] | None,
-    ) -> list[InnerLoopResult]:
+    ) -> list[Adaptation]:
         tests: Sequence[TensorBatch | None] = test_batches or [None] * len(batches)
         return [
             inner_loop(base, train, test_batch=test)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Self
 
-from metagcttt_core.adaptation.inner_loop import InnerLoopResult
+from metagcttt_core.adaptation.result import Adaptation
 from metagcttt_core.meta.tasks import MetaTask
 
 
@@ -36,7 +36,7 @@ class TaskReport:
 
     @classmethod
     def of(
-        cls, task: MetaTask, result: InnerLoopResult, initial_loss: float, expert_loss: float
+        cls, task: MetaTask, result: Adaptation, initial_loss: float, expert_loss: float
     ) -> Self:
         """The report of a task with the outcome of its inner loop."""
         return cls(

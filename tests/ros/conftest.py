@@ -101,8 +101,8 @@ def slow_adaptation(monkeypatch: pytest.MonkeyPatch):
     """Adaptations wait until the test lets them go on, or until they are cancelled."""
     go_on = threading.Event()
 
-    def slow_adapt(*args, should_stop, **kwargs):
-        while not (go_on.wait(0.001) or should_stop()):
+    def slow_adapt(*args, should_stop=None, **kwargs):
+        while should_stop and not (go_on.wait(0.001) or should_stop()):
             pass
         return adapt(*args, should_stop=should_stop, **kwargs)
 

@@ -40,7 +40,7 @@ class PolicyRig:
 
     def wait_until_adapting(self) -> None:
         self.graph.wait(
-            lambda: self.session._query and self.session._query.adapting, 'an adaptation'
+            lambda: self.session._pursuit and self.session._pursuit.adapting, 'an adaptation'
         )
 
     def report(self, query_id: int = 1):

@@ -1,15 +1,18 @@
+from dataclasses import replace
+
 from metagcttt.converters import (
     action_message,
+    goal_message,
     occupancy_grid,
     state_message,
     to_array,
     to_floats,
+    to_goal,
     to_point,
     to_time,
 )
-from metagcttt.policy.adaptation_report import report_message
-from metagcttt_core import Adaptation, make_agent, SupportSet
-from metagcttt_interfaces.msg import MazeState
+from metagcttt.goal_in_force import Goal
+from metagcttt_interfaces.msg import GoalQuery, MazeState
 import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
 from sim_bridge import MazeMap
@@ -68,34 +71,14 @@ def test_action_message_names_what_it_answers() -> None:
     assert (list(message.values), message.adapted) == ([0.5, -1.0], True)
 
 
-def test_report_message_tells_support_and_losses() -> None:
-    support = SupportSet(
-        indices=np.array([4, 5, 9]),
-        segments=[(4, 6), (9, 10)],
-        episodes=np.array([1, 2]),
-        scores=np.array([-0.5, -0.7]),
-        num_relevant=7,
-        num_scored=5,
-        milliseconds=1.5,
-    )
-    agent = make_agent('gcbc', obs_dim=2, act_dim=2, hidden=(4,))
-    adaptation = Adaptation(agent, [3.0, 2.0], [4.0, 3.5, 3.6], 1, True, '', 0.25)
-    message = report_message(
-        to_time(0), query_id=3, episode_id=2, support=support, adaptation=adaptation
-    )
-    assert (message.relevant_trajectories, message.kept_trajectories) == (7, 2)
-    assert (message.transitions, message.filter_ms, message.adapt_ms) == (3, 1.5, 250.0)
-    assert (list(message.segment_starts), list(message.segment_stops)) == ([4, 9], [6, 10])
-    assert (message.steps, message.best_step, message.accepted) == (2, 1, True)
-    assert list(message.train_losses) == [3.0, 2.0]
-    assert list(message.test_losses) == [4.0, 3.5, 3.6]
-
-
-def test_report_message_without_a_result_keeps_the_reason() -> None:
-    message = report_message(
-        to_time(0), query_id=3, episode_id=2, support=None, adaptation=None, reason='cancelled'
-    )
-    assert (message.reason, message.accepted, message.transitions) == ('cancelled', False, 0)
+def test_goal_survives_the_way_through_a_message() -> None:
+    goal = Goal(query_id=3, episode_id=2, observation=VALUES, xy=(0.5, -1.0), seed=2**64 - 1)
+    message = goal_message(Header(frame_id='map'), goal, active=True, lease_s=1.5)
+    received = deserialize_message(serialize_message(message), GoalQuery)
+    assert (received.active, received.lease_s, received.header.frame_id) == (True, 1.5, 'map')
+    again = to_goal(received)
+    np.testing.assert_array_equal(again.observation, VALUES)
+    assert replace(again, observation=VALUES) == goal
 
 
 def test_occupancy_grid_starts_at_the_lower_left_corner() -> None:

@@ -39,7 +39,7 @@ def test_simulator_reports_what_it_does_with_actions(graph: Graph, make_rig) -> 
     rig.diagnosed(OK, 'stepping', '/sim_bridge_node')
     act(float('nan'))
     rig.diagnosed(ERROR, 'an action was ignored: the action is not finite', '/sim_bridge_node')
-    rig.diagnosed(WARN, 'the action is zero: none has come lately', '/sim_bridge_node')
+    rig.diagnosed(WARN, 'the action is zero: none was received recently', '/sim_bridge_node')
     act(0.0)
     rig.diagnosed(OK, 'stepping', '/sim_bridge_node')
     graph.node.destroy_publisher(actions)
@@ -58,7 +58,7 @@ def test_goal_node_reports_states_and_a_missing_policy(
     rig.state()
     graph.remove(rig.node)
     graph.publish('goal_pose', goal_pose(0.0, 4.0))
-    silence = 'a goal is in force, but no policy is to be heard'
+    silence = 'a goal is in force, but no policy status is received'
     rig.diagnosed(WARN, silence, '/goal_node', fresh=False)
 
 
@@ -108,7 +108,7 @@ def test_goal_node_repeats_the_goal_in_force_until_it_is_over(
     queries = graph.collect(GoalQuery, 'goal')
     states = graph.node.create_publisher(MazeState, 'state', EVERY)
     states.publish(MazeState(episode_id=1, observation=[0.0, 0.0]))
-    graph.wait(lambda: goal_node._state, 'the state')
+    graph.wait(lambda: goal_node._tracker.state, 'the state')
     graph.publish('goal_pose', goal_pose(0.0, 4.0))
     graph.wait(lambda: len(queries) >= 4, 'repetitions')
     assert all(query == queries[0] for query in queries)
@@ -135,7 +135,7 @@ def test_goal_is_given_up_when_simulated_time_stops_with_its_simulator(
     record = Record(graph, EVERY)
     states = graph.node.create_publisher(MazeState, 'state', EVERY)
     states.publish(MazeState(episode_id=1, observation=[0.0, 0.0]))
-    graph.wait(lambda: goal_node._state, 'the state')
+    graph.wait(lambda: goal_node._tracker.state, 'the state')
     graph.publish('goal_pose', goal_pose(0.0, 4.0))
     ended = graph.wait(lambda: record.of_kind(EpisodeEvent.ENDED), 'the end')
     assert ended[0].error_code == ReachGoal.Result.STATE_LOST

@@ -90,7 +90,7 @@ def test_killed_node_resumes_its_service_after_a_restart(
     sent = robot.commander.send(GOAL)
     robot.nodes[name].kill()
     if name == 'policy_node':
-        robot.diagnosed('/sim_bridge_node', 'the action is zero: none has come lately')
+        robot.diagnosed('/sim_bridge_node', 'the action is zero: none was received recently')
     if name == 'sim_bridge_node':
         robot.diagnosed('/policy_node', 'the action is zero: no state for')
     if name == 'goal_node':

@@ -89,7 +89,7 @@ def test_next_goal_is_waited_for(
     assert not rig.action_for(0).adapted
     change(rig.node, adaptation='hold')
     rig.goal(2)
-    rig.graph.wait(lambda: rig.session._query.query_id == 2, 'the second goal')
+    rig.graph.wait(lambda: rig.session._pursuit.goal.query_id == 2, 'the second goal')
     rig.wait_until_adapting()
     rig.state(step=1)
     rig.graph.wait(lambda: rig.session._state.step == 1, 'the state')
@@ -189,7 +189,7 @@ def test_silence_of_the_policy_is_diagnosed(make_goal_rig: Callable[..., GoalRig
     rig.graph.wait(lambda: rig.node._examine().message == 'goal 1 in force', 'the goal')
     change(rig.node, policy_timeout_s=0.1)
     rig.graph.wait(
-        lambda: 'no policy is to be heard' in rig.node._examine().message, 'the warning'
+        lambda: 'no policy status is received' in rig.node._examine().message, 'the warning'
     )
 
 
@@ -200,7 +200,7 @@ def test_action_gets_too_old_for_the_simulator(graph: Graph) -> None:
     actions = graph.node.create_publisher(ActionCommand, 'action', RELIABLE)
     graph.wait(lambda: states and actions.get_subscription_count(), 'the simulator')
     actions.publish(ActionCommand(episode_id=1, values=[1.0, 0.0]))
-    age = 'the action is zero: none has come lately'
+    age = 'the action is zero: none was received recently'
     graph.wait(lambda: node._action.any(), 'the action')
     graph.wait_for(0.3)
     assert node._examine().message != age

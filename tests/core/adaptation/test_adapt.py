@@ -247,6 +247,23 @@ def test_zero_steps_give_the_base_agent(dataset):
     assert result.reason == 'no adaptation steps were asked for'
 
 
+@pytest.mark.parametrize('settings', [{}, {'steps': 0}, {'early_stopping': True, 'lr': 1e3}])
+def test_result_tells_what_it_was_adapted_on(dataset, settings):
+    support = support_of(range(11))
+    told = []
+    result = adapt(
+        tiny_agent(),
+        dataset,
+        support,
+        GOAL,
+        quick(**settings),
+        on_step=lambda step, losses: told.append((step, losses['total'].item())),
+    )
+    assert result.support is support
+    assert result.accepted == (result.best_step > 0) == (not result.reason)
+    assert told == list(enumerate(result.train_losses, start=1))
+
+
 def test_cancelled_within_one_step(dataset):
     agent = tiny_agent()
     weights = weights_of(agent)

@@ -221,3 +221,41 @@ def test_not_cancelling_changes_nothing():
     result = run_inner_loop(base, batches, lr=0.1, should_stop=lambda: bool(asked.append(1)))
     assert len(asked) == 4
     assert_bit_equal(result.agent, weights_of(run_inner_loop(base, batches, lr=0.1).agent))
+
+
+@pytest.mark.parametrize('actor_only', [False, True])
+def test_every_step_is_told_with_its_losses_by_part(actor_only):
+    base = tiny_agent('gciql')
+    batches = batches_for(base, 4)
+    told = []
+    result = run_inner_loop(
+        base,
+        batches,
+        lr=0.1,
+        actor_only=actor_only,
+        on_step=lambda step, losses: told.append((step, dict(losses))),
+    )
+    assert [step for step, _ in told] == [1, 2, 3, 4]
+    assert [losses['total'].item() for _, losses in told] == result.train_losses
+    first = {
+        name: value.item()
+        for name, value in base.losses(batches[0], actor_only=actor_only)[1].items()
+    }
+    assert {name: told[0][1][name].item() for name in first} == first
+    assert not any(value.requires_grad for _, losses in told for value in losses.values())
+    untold = run_inner_loop(base, batches, lr=0.1, actor_only=actor_only)
+    assert_bit_equal(result.agent, weights_of(untold.agent))
+
+
+def test_no_step_is_told_after_cancelling():
+    base = tiny_agent()
+    told = []
+    with pytest.raises(AdaptationCancelled):
+        run_inner_loop(
+            base,
+            batches_for(base, 8),
+            lr=0.1,
+            should_stop=lambda: len(told) == 3,
+            on_step=lambda step, losses: told.append(step),
+        )
+    assert told == [1, 2, 3]

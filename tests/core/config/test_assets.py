@@ -1,6 +1,9 @@
 """Where the committed assets are found."""
 
+from pathlib import Path
+
 from metagcttt_core.config import assets_dir
+from metagcttt_core.config.assets import checkpoint_path, dataset_path
 import pytest
 
 
@@ -28,3 +31,13 @@ def test_assets_of_the_checkout_are_the_default(value, monkeypatch, request):
     else:
         with pytest.raises(FileNotFoundError, match=str(expected)):
             assets_dir()
+
+
+def test_empty_path_names_the_committed_files(tmp_path, monkeypatch):
+    monkeypatch.setenv('METAGCTTT_ASSETS', str(tmp_path))
+    monkeypatch.setenv('HOME', '/home/someone')
+    folder = tmp_path / 'pointmaze-medium-navigate'
+    assert checkpoint_path('') == folder / 'meta'
+    assert dataset_path('') == folder / 'dataset.npz'
+    assert checkpoint_path('~/policy') == Path('/home/someone/policy')
+    assert dataset_path('data.npz') == Path('data.npz')

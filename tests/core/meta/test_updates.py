@@ -3,7 +3,7 @@
 import copy
 
 from metagcttt_core import MetaConfig
-from metagcttt_core.adaptation.inner_loop import InnerLoopResult
+from metagcttt_core.adaptation.result import Adaptation
 from metagcttt_core.meta.experts import Expert
 from metagcttt_core.meta.updates import (
     continual,
@@ -31,7 +31,7 @@ def constant(value: float, name: str = 'gcbc'):
 
 
 def expert_of(agent, best_step: int = 1, test_batch=None) -> Expert:
-    return Expert(InnerLoopResult(agent, [0.0], [0.0], best_step), test_batch, lambda: [])
+    return Expert(Adaptation(agent, [0.0], [0.0], best_step), test_batch, lambda: [])
 
 
 def held_out_batch(agent, seed: int = 0):

@@ -1,6 +1,6 @@
 import math
 
-from metagcttt.goal.goals import Goal, goal_ending, GoalCatalog, Verdict
+from metagcttt.goal.goals import AcceptedGoal, goal_ending, GoalCatalog, RobotState, Verdict
 from metagcttt_core import TrajectoryDataset, TrajectoryFilter
 import numpy as np
 import pytest
@@ -69,8 +69,8 @@ def test_dataset_of_another_robot_is_refused() -> None:
         GoalCatalog(ant, TrajectoryFilter(maze_walks('pointmaze-medium-v0')))
 
 
-def ending(xy=(9.0, 0.0), step=10, ended=False, success=False, is_task=False, max_steps=100):
-    goal = Goal(
+def ending(xy=(9.0, 0.0), step=10, ended=False, success=False, is_task=False, **limits):
+    goal = AcceptedGoal(
         query_id=1,
         episode_id=1,
         observation=np.zeros(2),
@@ -78,16 +78,10 @@ def ending(xy=(9.0, 0.0), step=10, ended=False, success=False, is_task=False, ma
         seed=0,
         first_step=5,
         is_task=is_task,
+        **limits,
     )
-    return goal_ending(
-        goal,
-        xy=xy,
-        step=step,
-        ended=ended,
-        success=success,
-        tolerance_m=1.0,
-        max_steps=max_steps,
-    )
+    state = RobotState(1, step, xy, ended, success)
+    return goal_ending(goal, state, tolerance_m=1.0, max_steps=100)
 
 
 def test_goal_is_under_way_at_a_distance() -> None:
@@ -113,6 +107,11 @@ def test_goal_times_out_when_its_steps_are_used_up() -> None:
     assert ending(step=105) == Verdict(
         'TIMED_OUT', 'not reached in 100 steps, 9.00 m from the goal'
     )
+
+
+def test_goal_s_own_limit_goes_before_the_node_s() -> None:
+    assert ending(step=7, max_steps=3) is None
+    assert ending(step=8, max_steps=3).error == 'TIMED_OUT'
 
 
 def test_goal_times_out_when_the_episode_ends_elsewhere() -> None:

@@ -180,9 +180,9 @@ def test_older_episodes_that_are_heard_of_late_leave_the_goal(rig: Rig) -> None:
     rig.state(episode_id=7)
     rig.send(4.0, 0.0)
     rig.query(1)
-    before = {'source_timestamp': rig.node._state_published_ns - 1}
+    before = {'source_timestamp': rig.node._tracker._published_ns - 1}
     rig.node._on_event(EpisodeEvent(kind=EpisodeEvent.STARTED, episode_id=1), before)
-    assert rig.node._goal is not None
+    assert rig.node._tracker.goal is not None
 
 
 def test_task_goal_of_another_size_is_rejected(rig: Rig) -> None:

@@ -1,3 +1,4 @@
+import math
 from pathlib import Path
 import re
 
@@ -187,6 +188,8 @@ def test_goal_waits_for_its_episode_and_refuses_one_that_is_over(rig: GoalRig) -
     )
     new = ReachGoal.Goal(pose=goal_pose(*FREE), episode_id=3, request_id='new')
     sent = rig.commander.send_request(new)
+    rig.graph.wait(lambda: sent.feedback, 'feedback before the first state of the episode')
+    assert (math.isnan(sent.feedback.distance_m), sent.feedback.steps) == (True, 0)
     rig.state(x=4.0, step=10, episode_id=2)
     rig.state(x=4.0, episode_id=3)
     assert sent.result().success

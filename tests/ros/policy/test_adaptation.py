@@ -4,6 +4,7 @@ from functools import partial
 from pathlib import Path
 import threading
 
+from metagcttt.goal_in_force import Goal
 from metagcttt.policy import deployment
 from metagcttt_core import adapt, FilterConfig, make_agent, save_checkpoint, TTTConfig
 from metagcttt_core.adaptation import AdaptationCancelled, inner_loop
@@ -39,7 +40,7 @@ def test_holding_policy_answers_with_the_expert_only(make_rig, slow_adaptation) 
     rig = make_rig(adaptation='hold')
     rig.state()
     rig.goal()
-    rig.graph.wait(lambda: rig.session._query, 'the goal')
+    rig.graph.wait(lambda: rig.session._pursuit, 'the goal')
     slow_adaptation.set()
     action = rig.action()
     assert (action.query_id, action.adapted, len(rig.record.actions)) == (1, True, 1)
@@ -81,7 +82,7 @@ def test_newer_goal_cancels_the_adaptation_under_way(make_rig, slow_adaptation) 
     rig.state()
     rig.goal(1)
     rig.graph.wait(
-        lambda: rig.session._query and rig.session._query.adapting, 'the first adaptation'
+        lambda: rig.session._pursuit and rig.session._pursuit.adapting, 'the first adaptation'
     )
     rig.goal(2)
     report = rig.report(1)
@@ -111,7 +112,7 @@ def test_goal_that_comes_before_its_episode_waits_for_it(make_rig) -> None:
     rig = make_rig(adaptation='hold')
     rig.state()
     rig.goal(episode_id=2)
-    rig.graph.wait(lambda: rig.session._query and rig.session._state, 'both')
+    rig.graph.wait(lambda: rig.session._pursuit and rig.session._state, 'both')
     rig.state(episode_id=2)
     action = rig.action()
     assert (action.episode_id, action.adapted) == (2, True)
@@ -132,8 +133,8 @@ def test_failing_adaptation_is_reported_and_the_base_policy_acts(
     def fail(*args, **kwargs):
         raise RuntimeError('out of memory')
 
-    monkeypatch.setattr(deployment, 'adapt', fail)
     rig = make_rig(adaptation='hold')
+    monkeypatch.setattr(deployment, 'adapt', fail)
     rig.state()
     rig.goal()
     assert rig.report().reason == 'failed: out of memory'
@@ -223,7 +224,7 @@ def test_superseded_adaptation_takes_no_further_gradient_step(
     rig.graph.wait(in_third_step.is_set, 'the third step')
     rig.set(adapt_steps=4)
     rig.goal(2)
-    rig.graph.wait(lambda: rig.session._query.query_id == 2, 'the second goal')
+    rig.graph.wait(lambda: rig.session._pursuit.goal.query_id == 2, 'the second goal')
     superseded.set()
     assert 'cancelled' in rig.report(1).reason
     assert rig.report(2).accepted
@@ -254,7 +255,7 @@ def test_policy_with_a_critic_adapts_anew_as_the_offline_adaptation_does(critic_
         support = deployed.trajectory_filter.query(
             np.array(xy), np.array(TASK_1_GOAL), rig.base.value_fn
         )
-        config = rig.session._query.config
+        config = rig.session._pursuit.config
         expert = adapt(rig.base, deployed.dataset, support, np.array(TASK_1_GOAL), config).agent
         np.testing.assert_array_equal(action.values, expert.act(np.array(xy), TASK_1_GOAL))
     rig.graph.wait(lambda: len(rig.record.reports) == 2, 'the second report')
@@ -306,7 +307,7 @@ def test_stop_is_heeded_before_the_critic_is_evaluated_any_further(
     deployed = deployment.load_deployment(
         str(tmp_path / 'gciql'), str(dataset_file), FilterConfig()
     )
-    goal = np.array(TASK_1_GOAL)
+    goal = Goal(1, 1, np.array(TASK_1_GOAL), TASK_1_GOAL, seed=0)
     evaluated: list[int] = []
 
     def value(self, observations, goal):
@@ -315,9 +316,9 @@ def test_stop_is_heeded_before_the_critic_is_evaluated_any_further(
 
     monkeypatch.setattr(StateValue, '__call__', value)
     with pytest.raises(AdaptationCancelled, match='while the critic was evaluated'):
-        deployment.answer_query(
-            deployed, np.zeros(2), goal, TTTConfig(steps=1), seed=0, should_stop=lambda: True
+        deployment.adapt_to_goal(
+            deployed, np.zeros(2), goal, TTTConfig(steps=1), should_stop=lambda: True
         )
     assert evaluated == []
-    deployment.foresee_values(deployed, goal, should_stop=lambda: False)
+    deployment.prefetch_values(deployed, goal, should_stop=lambda: False)
     assert sum(evaluated) == deployed.dataset.num_rows

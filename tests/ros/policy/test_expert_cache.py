@@ -1,4 +1,3 @@
-from metagcttt.policy.deployment import Outcome
 from metagcttt.policy.expert_cache import ExpertCache
 from metagcttt_core import Adaptation, TTTConfig
 import numpy as np
@@ -8,8 +7,8 @@ CONFIG = TTTConfig(steps=3)
 HERE, GOAL = np.array([0.2, 9.0, 0.4]), np.array([5.1, 9.0, 5.2])
 
 
-def outcome(accepted: bool = True) -> Outcome:
-    return Outcome(None, Adaptation(object(), [], [], 3, accepted, '', 0.0))
+def adaptation(accepted: bool = True) -> Adaptation:
+    return Adaptation(object(), best_step=3 if accepted else 0)
 
 
 @pytest.fixture
@@ -26,7 +25,7 @@ def test_queries_share_an_expert_within_a_cell_only(cache: ExpertCache) -> None:
 
 
 def test_expert_unused_for_longest_is_dropped(cache: ExpertCache) -> None:
-    first, second, third = outcome(), outcome(), outcome()
+    first, second, third = adaptation(), adaptation(), adaptation()
     cache.keep('a', first)
     cache.keep('b', second)
     assert cache.find('a') is first
@@ -36,8 +35,8 @@ def test_expert_unused_for_longest_is_dropped(cache: ExpertCache) -> None:
 
 
 def test_only_experts_are_kept_and_none_without_size(cache: ExpertCache) -> None:
-    cache.keep('a', outcome(accepted=False))
+    cache.keep('a', adaptation(accepted=False))
     assert cache.find('a') is None
     off = ExpertCache(0, cell_m=1.0, position_dims=(0, 1))
-    off.keep('a', outcome())
+    off.keep('a', adaptation())
     assert len(off) == 0

@@ -112,7 +112,7 @@ def test_lifecycle_through_its_services(make_rig) -> None:
     rig.state()
     rig.goal()
     assert change(rig, Transition.TRANSITION_CONFIGURE)
-    rig.graph.wait(lambda: rig.session._state and rig.session._query, 'state and goal')
+    rig.graph.wait(lambda: rig.session._state and rig.session._pursuit, 'state and goal')
     assert rig.record.actions == []
     assert change(rig, Transition.TRANSITION_ACTIVATE)
     rig.action_for(0)
@@ -148,7 +148,7 @@ def test_deactivation_cancels_and_activation_adapts_again(make_rig, slow_adaptat
     assert change(rig, Transition.TRANSITION_DEACTIVATE)
     assert rig.record.actions == []
     slow_adaptation.set()
-    rig.graph.wait(lambda: not rig.session._query.adapting, 'the end of the adaptation')
+    rig.graph.wait(lambda: not rig.session._pursuit.adapting, 'the end of the adaptation')
     assert change(rig, Transition.TRANSITION_ACTIVATE)
     assert rig.action().adapted
 
@@ -215,7 +215,7 @@ def test_adaptation_parameters_apply_to_the_next_query(make_rig) -> None:
     rig.goal(2)
     report = rig.report(2)
     assert (report.steps, len(report.test_losses)) == (5, 6)
-    config = rig.session._query.config
+    config = rig.session._pursuit.config
     assert (config.lr, config.batch_size) == (0.01, 16)
 
 

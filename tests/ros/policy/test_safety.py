@@ -1,6 +1,5 @@
-from metagcttt.policy.pilot import State
+from metagcttt.policy.decision import State
 from metagcttt.policy.safety import Safety
-from metagcttt.senders import Senders
 import numpy as np
 
 FINE = State(1, 0, np.zeros(2), ended=False)
@@ -8,14 +7,6 @@ FINE = State(1, 0, np.zeros(2), ended=False)
 
 def reason(safety: Safety, now_s: float = 0.0, clock_s: float = 0.0, state: State = FINE) -> str:
     return safety.zero_reason(state, now_s=now_s, clock_s=clock_s, timeout_s=0.5)
-
-
-def test_senders_are_forgotten_after_a_second_of_silence() -> None:
-    senders = Senders()
-    assert senders.count(0.0) == 0
-    for instance, now_s in [(1, 0.0), (2, 0.3), (1, 0.6)]:
-        senders.hear(instance, now_s)
-    assert [senders.count(now_s) for now_s in (0.6, 1.3, 1.31, 1.6, 1.7)] == [2, 2, 1, 1, 0]
 
 
 def test_state_is_stale_by_either_clock() -> None:
@@ -33,21 +24,21 @@ def test_state_is_stale_by_either_clock() -> None:
 def test_goal_is_lost_when_its_lease_ends_and_found_with_the_next_message() -> None:
     safety = Safety(enabled=True)
     safety.saw_goal(10.0, lease_s=2.0)
-    assert not safety.lose_goal(3, 12.0)
+    assert not safety.expire_goal(3, 12.0)
     safety.saw_goal(11.0, lease_s=2.0)
-    assert not safety.lose_goal(3, 13.0)
-    assert safety.lose_goal(3, 13.1)
+    assert not safety.expire_goal(3, 13.0)
+    assert safety.expire_goal(3, 13.1)
     assert reason(safety) == 'goal 3 was not repeated for 2 s and is dropped'
     safety.saw_goal(14.0, lease_s=0.0)
     assert reason(safety) == ''
-    assert not safety.lose_goal(3, 10**6)
+    assert not safety.expire_goal(3, 10**6)
 
 
 def test_order_of_the_reasons() -> None:
     safety = Safety(enabled=False)
-    safety.rivals.hear(5, 10.0)
+    safety.rivals.saw(5, 10.0)
     safety.saw_goal(0.0, lease_s=1.0)
-    safety.lose_goal(1, 10.0)
+    safety.expire_goal(1, 10.0)
     safety.saw_state(0.0, 0.0)
     bad = State(1, 0, np.zeros(0), ended=False, fault='the state has 0 values, 2 are needed')
     found = [reason(safety, 10.0, 10.0, bad)]

@@ -198,7 +198,7 @@ def test_paused_world_moves_by_single_steps_only(graph: Graph) -> None:
     elapsed = seconds(states[-1].header.stamp) - seconds(stopped.header.stamp)
     assert elapsed == pytest.approx(0.3)
     assert states[-1].position.x > stopped.position.x
-    assert pause(graph, False).startswith('runs, step')
+    assert pause(graph, False).startswith('running, step')
     graph.wait(lambda: states[-1].step > stopped.step + 6, 'the world to go on')
 
 
@@ -209,7 +209,7 @@ def test_paused_lockstep_keeps_the_action_until_the_step(graph: Graph) -> None:
     early = graph.call(Trigger, 'step', Trigger.Request())
     assert (early.success, early.message) == (
         False,
-        'no action has arrived for step 0 of episode 1',
+        'no action was received for step 0 of episode 1',
     )
     graph.publish('action', answer(states[0]))
     graph.wait(lambda: graph.call(Trigger, 'step', Trigger.Request()).success, 'the step')

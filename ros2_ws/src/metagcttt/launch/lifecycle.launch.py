@@ -1,6 +1,6 @@
 """Start one robot whose policy node is configured and activated by launch.
 
-Where the policy cannot be configured, everything is shut down.
+If the policy cannot be configured, everything is shut down.
 """
 
 from launch import LaunchDescription
@@ -23,7 +23,7 @@ ARGUMENTS = ('namespace', 'stepping', 'params_file', 'checkpoint', 'dataset')
 
 
 def generate_launch_description() -> LaunchDescription:
-    """The robot without its policy, the policy, and what drives its lifecycle."""
+    """The robot without its policy, the policy node and the handlers of its lifecycle."""
     policy = LifecycleNode(
         package='metagcttt',
         executable='policy_node',
@@ -63,7 +63,7 @@ def generate_launch_description() -> LaunchDescription:
                     'policy': 'false',
                 }.items(),
             ),
-            # The handlers before the events that they answer.
+            # The handlers come before the events they handle.
             RegisterEventHandler(
                 OnStateTransition(
                     target_lifecycle_node=policy,

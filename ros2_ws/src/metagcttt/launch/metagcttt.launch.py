@@ -1,4 +1,4 @@
-"""Start one robot: the simulator, the goal node and the policy; also recorder, pictures, RViz."""
+"""Start one robot: simulator, goal node and policy; optionally recorder and visualization."""
 
 from launch import LaunchDescription
 from launch.actions import SetEnvironmentVariable
@@ -16,7 +16,7 @@ SHOWN = ('map', 'odom', 'path', 'markers', 'goal_pose')
 
 
 def generate_launch_description() -> LaunchDescription:
-    """The nodes; all that they can be told is in `declare` or the parameter file."""
+    """The nodes of one robot; other settings are in the parameter file."""
     namespace = LaunchConfiguration('namespace')
     common = {
         'package': 'metagcttt',
@@ -33,7 +33,7 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             *declare(),
-            # One machine, unless the user says otherwise.
+            # Only this machine, unless the user sets it.
             SetEnvironmentVariable(
                 'ROS_AUTOMATIC_DISCOVERY_RANGE',
                 EnvironmentVariable('ROS_AUTOMATIC_DISCOVERY_RANGE', default_value='LOCALHOST'),

@@ -1,4 +1,4 @@
-"""Start two robots in one graph, each in a namespace, a maze and a time of its own."""
+"""Start two robots in one graph, each with its own namespace, maze and simulated time."""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, GroupAction, IncludeLaunchDescription
@@ -19,14 +19,14 @@ CHECKPOINTS = [
     DeclareLaunchArgument(
         f'{robot}_checkpoint',
         default_value='',
-        description=f'folder of the policy of {robot}; empty: committed one',
+        description=f'folder of the policy of {robot}; empty: the committed one',
     )
     for robot in ROBOTS
 ]
 
 
 def robot_group(robot: str) -> GroupAction:
-    """One robot; the group keeps its arguments from the other."""
+    """One robot, in a group that scopes its arguments."""
     one_robot = PathJoinSubstitution([SHARE, 'launch', 'metagcttt.launch.py'])
     arguments = {name: LaunchConfiguration(name) for name in SHARED}
     arguments['namespace'] = robot
@@ -43,7 +43,7 @@ def robot_group(robot: str) -> GroupAction:
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Two robots and, if asked for, one recorder for both."""
+    """Two robots and, with `record`, one recorder for both."""
     record = LaunchConfiguration('record')
     return LaunchDescription(
         [

@@ -2,6 +2,6 @@
 
 import os
 
-# Without this a NumPy scalar in a message field is published as garbage, silently. Generated
-# message code reads it when it is imported, hence before everything else.
+# Without this a NumPy scalar in a message field is silently published as garbage. The generated
+# message code reads it at import, hence before everything else.
 os.environ.setdefault('ROS_PYTHON_CHECK_FIELDS', '1')

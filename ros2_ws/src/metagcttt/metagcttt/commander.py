@@ -1,4 +1,4 @@
-"""For programs: drive the robot with function calls, blocking or not."""
+"""Client for programs: drives a robot with blocking or non-blocking calls."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -30,19 +30,19 @@ class NoAnswerError(RuntimeError):
 
 
 class GoalLostError(NoAnswerError):
-    """The goal node fell silent, and what it knew is lost."""
+    """The goal node is silent, and its goal is lost."""
 
 
 @dataclass(frozen=True)
 class ReachResult:
-    """What became of a goal.
+    """Result of a goal.
 
     Attributes:
         success: Whether the robot is within the goal tolerance.
         steps: Control steps it took.
         seconds: Time it took, by the goal node's clock.
         error_code: One of the constants of `ReachGoal.Result`; 0 on success.
-        error_msg: The same in words.
+        error_msg: The error in words.
     """
 
     success: bool
@@ -55,8 +55,8 @@ class ReachResult:
 class RobotCommander(Node):
     """Sends goals and tasks to one robot.
 
-    It needs no thread and nobody to spin it: whatever waits takes in messages meanwhile. For the
-    asynchronous way call `send`, then `is_done` now and then, and `result` at the end.
+    Waiting calls spin the node, so no thread or executor is needed. To go on meanwhile, call
+    `send`, poll `is_done` and take the `result` at the end.
 
     Example::
 
@@ -74,14 +74,14 @@ class RobotCommander(Node):
         while_waiting: Callable[[], None] = lambda: None,
         **kwargs: Any,
     ) -> None:
-        """Join the graph.
+        """Create the node.
 
         Args:
             name: Name of the node.
             frame_id: Frame of positions.
-            executor: To spin while waiting; one of its own by default.
-            while_waiting: Called again and again while waiting; an error it raises gets through.
-            kwargs: For `rclpy.node.Node`, such as the robot's `namespace`.
+            executor: Executor to spin while waiting; its own by default.
+            while_waiting: Called repeatedly while waiting; its exceptions propagate.
+            kwargs: For `rclpy.node.Node`, such as the `namespace` of the robot.
         """
         super().__init__(name, **kwargs)
         self._frame_id = frame_id
@@ -92,7 +92,7 @@ class RobotCommander(Node):
         self._set_task = self.create_client(SetTask, 'set_task')
         self._reset = self.create_client(Trigger, 'reset')
         self._enable = self.create_client(SetBool, 'enable')
-        self._episode_id = 0  # begun by this commander; the goal node may not know it yet
+        self._episode_id = 0  # started by this commander; the goal node may not know it yet
         self._refusals: dict[str, EpisodeEvent] = {}
         self._refusals_from = self.create_subscription(
             EpisodeEvent, 'episode', self._on_event, EVENTS
@@ -103,16 +103,16 @@ class RobotCommander(Node):
     def reach(
         self, goal: ArrayLike, *, max_steps: int = 0, timeout_s: float = 60.0
     ) -> ReachResult:
-        """Drive to a goal and wait until that is over.
+        """Drive to a goal and wait for the result.
 
         Args:
             goal: See `send`.
             max_steps: See `send`.
-            timeout_s: Longest wait, seconds; the goal is canceled then.
+            timeout_s: Longest wait, seconds, after which the goal is canceled.
 
         Raises:
             NoAnswerError: If it takes longer.
-            GoalLostError: If the goal node falls silent.
+            GoalLostError: If the goal node becomes silent.
         """
         sent = self.send(goal, max_steps=max_steps, timeout_s=timeout_s)
         try:
@@ -124,7 +124,7 @@ class RobotCommander(Node):
             raise
 
     def send(self, goal: ArrayLike, *, max_steps: int = 0, timeout_s: float = 10.0) -> 'SentGoal':
-        """Send a goal and return when the goal node has taken or refused it.
+        """Send a goal and return when the goal node has accepted or rejected it.
 
         Args:
             goal: Position (x, y) in metres, or a full goal observation, shape (obs_dim,).
@@ -148,7 +148,7 @@ class RobotCommander(Node):
         return self.send_request(request, timeout_s)
 
     def send_request(self, request: ReachGoal.Goal, timeout_s: float = 10.0) -> 'SentGoal':
-        """Send an action goal as it is; its `request_id` has to be unique."""
+        """Send an action goal unchanged; its `request_id` must be unique."""
         self.wait(self._reach_goal.server_is_ready, 'action reach_goal', timeout_s)
         self.wait(
             lambda: self._refusals_from.get_publisher_count() > 0, 'topic episode', timeout_s
@@ -161,7 +161,7 @@ class RobotCommander(Node):
             sent.begin(handle)
             return sent
         self.wait(
-            lambda: request.request_id in self._refusals, 'why a goal was refused', timeout_s
+            lambda: request.request_id in self._refusals, 'why a goal was rejected', timeout_s
         )
         event = self._refusals.pop(request.request_id)
         sent.refuse(ReachResult(False, error_code=event.error_code, error_msg=event.reason))
@@ -169,7 +169,7 @@ class RobotCommander(Node):
 
     def _on_event(self, message: EpisodeEvent) -> None:
         if message.kind == EpisodeEvent.STARTED and message.episode_id != self._episode_id:
-            self._episode_id = 0  # somebody else began it
+            self._episode_id = 0  # started by another node
         if message.kind == EpisodeEvent.GOAL_REJECTED and message.request_id:
             self._refusals[message.request_id] = message
 
@@ -178,7 +178,7 @@ class RobotCommander(Node):
     def set_task(
         self, task_id: int, seed: int = 0, *, send_goal: bool = False, timeout_s: float = 10.0
     ) -> SetTask.Response:
-        """Put the robot at the start of an evaluation task; see SetTask for the answer."""
+        """Reset the robot to the start of an evaluation task; see SetTask for the response."""
         request = SetTask.Request(task_id=task_id, seed=seed, send_goal=send_goal)
         response = self._call(self._set_task, request, timeout_s)
         if response.success:
@@ -186,12 +186,12 @@ class RobotCommander(Node):
         return response
 
     def reset(self, timeout_s: float = 10.0) -> Trigger.Response:
-        """Begin an episode without a task, at a random place."""
+        """Start an episode without a task, at a random position."""
         self._episode_id = 0
         return self._call(self._reset, Trigger.Request(), timeout_s)
 
     def enable(self, enabled: bool, timeout_s: float = 10.0) -> SetBool.Response:
-        """Let the robot move, or make every action zero."""
+        """Allow the robot to move, or make every action zero."""
         return self._call(self._enable, SetBool.Request(data=enabled), timeout_s)
 
     def _call(self, client: Client, request: Any, timeout_s: float) -> Any:
@@ -207,10 +207,10 @@ class RobotCommander(Node):
     # --- waiting -----------------------------------------------------------------------------
 
     def wait(self, condition: Callable[[], Any], what: str, timeout_s: float) -> None:
-        """Take in messages until `condition` holds.
+        """Spin until `condition` holds.
 
         Raises:
-            NoAnswerError: If it does not hold within `timeout_s`; names `what`.
+            NoAnswerError: If it does not hold within `timeout_s`; the message names `what`.
         """
         deadline = time.monotonic() + timeout_s
         while not condition():
@@ -220,25 +220,25 @@ class RobotCommander(Node):
             self._spun.spin_once(timeout_sec=0.05)
 
     def take_in(self) -> None:
-        """Take in a message that is there already."""
+        """Handle one message that has already arrived."""
         self._spun.spin_once(timeout_sec=0)
 
     def destroy_node(self) -> None:
-        """Leave the graph."""
+        """Destroy the node."""
         self._spun.remove_node(self)
         self._reach_goal.destroy()
         super().destroy_node()
 
 
 class SentGoal:
-    """A goal that was sent; made by `RobotCommander.send`.
+    """A goal that was sent by `RobotCommander.send`.
 
     Attributes:
-        feedback: The newest feedback, None before the first.
+        feedback: The newest feedback; None before the first.
     """
 
     def __init__(self, commander: RobotCommander) -> None:
-        """Nothing is known yet."""
+        """Create a goal without an answer."""
         self.feedback: ReachGoal.Feedback | None = None
         self._commander = commander
         self._heard_s = self._looked_s = float('-inf')
@@ -248,14 +248,14 @@ class SentGoal:
 
     @property
     def accepted(self) -> bool:
-        """Whether the goal node took it."""
+        """True when the goal node accepted it."""
         return self._handle is not None
 
     def is_done(self) -> bool:
-        """Whether the result is known; takes in waiting messages first.
+        """True when the result is known; handles waiting messages first.
 
         Raises:
-            GoalLostError: If the goal node has fallen silent.
+            GoalLostError: If the goal node has become silent.
         """
         if self._result is None:
             self._commander.take_in()
@@ -266,14 +266,14 @@ class SentGoal:
 
         Raises:
             NoAnswerError: If there is none within `timeout_s`.
-            GoalLostError: If the goal node falls silent.
+            GoalLostError: If the goal node becomes silent.
         """
         self._commander.wait(self._is_known, 'the goal', timeout_s)
         assert self._result is not None
         return self._result
 
     def cancel(self, timeout_s: float = 10.0) -> bool:
-        """Ask to give the goal up; whether it was still under way. `result` says how it ended."""
+        """Cancel the goal; true if it was still under way. `result` says how it ended."""
         if self._handle is None or self._result is not None:
             return False
         future = self._handle.cancel_goal_async()
@@ -281,25 +281,25 @@ class SentGoal:
         return bool(future.result().goals_canceling)
 
     def on_feedback(self, message: Any) -> None:
-        """Called with every feedback message."""
+        """Record a feedback message."""
         self.feedback = message.feedback
         self._heard_s = time.monotonic()
 
     def begin(self, handle: ClientGoalHandle) -> None:
-        """The goal was taken."""
+        """Record that the goal was accepted."""
         self._handle = handle
         self._answer = handle.get_result_async()
         self._answer.add_done_callback(self._on_result)
 
     def refuse(self, result: ReachResult) -> None:
-        """The goal was refused."""
+        """Record that the goal was rejected."""
         self._result = result
 
     def _is_known(self) -> bool:
-        """Whether the result is known; an error when the goal node is no longer to be heard."""
+        """True when the result is known; raises when the goal node is silent."""
         now_s = time.monotonic()
         if now_s - self._looked_s > SILENT_S / 2:
-            self._heard_s = now_s  # nobody has taken in what it said meanwhile
+            self._heard_s = now_s  # nothing was spun meanwhile
         self._looked_s = now_s
         if self._result is None and now_s - self._heard_s > SILENT_S:
             raise GoalLostError(

@@ -1,27 +1,25 @@
-"""Between messages and arrays. Pure functions; no node is needed to use them."""
+"""Conversions between messages and arrays, as pure functions."""
 
 from array import array
 from collections.abc import Iterable, Sequence
-import math
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point
-from metagcttt_interfaces.action import ReachGoal
-from metagcttt_interfaces.msg import ActionCommand, MazeState, PolicyStatus
+from metagcttt_interfaces.msg import ActionCommand, GoalQuery, MazeState
 from nav_msgs.msg import OccupancyGrid
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sim_bridge import MazeMap
 from std_msgs.msg import Header
 
-from metagcttt.goal.goals import Goal
+from metagcttt.goal_in_force import Goal
 
 OCCUPIED = 100
 FREE = 0
 
 
 def to_floats(values: ArrayLike) -> 'array[float]':
-    """Numbers of shape (n,) as what a float64[] field takes fastest."""
+    """Numbers of shape (n,) in the type that a float64[] field takes fastest."""
     floats = array('d')
     floats.frombytes(np.ascontiguousarray(values, dtype=np.float64).tobytes())
     return floats
@@ -39,7 +37,7 @@ def to_point(xy: Iterable[float]) -> Point:
 
 
 def to_time(nanoseconds: int) -> Time:
-    """Nanoseconds as a stamp."""
+    """A time stamp from nanoseconds."""
     seconds, rest = divmod(nanoseconds, 10**9)
     return Time(sec=seconds, nanosec=rest)
 
@@ -55,7 +53,7 @@ def state_message(
     truncated: bool,
     success: bool,
 ) -> MazeState:
-    """What the simulator publishes after one control step."""
+    """The state after a control step."""
     return MazeState(
         header=header,
         episode_id=episode_id,
@@ -78,7 +76,7 @@ def action_message(
     adapted: bool,
     instance: int = 0,
 ) -> ActionCommand:
-    """The answer of the policy to one state."""
+    """The action for a state."""
     return ActionCommand(
         header=Header(stamp=stamp),
         episode_id=episode_id,
@@ -90,27 +88,33 @@ def action_message(
     )
 
 
-def feedback_message(goal: Goal, state: MazeState, policy: PolicyStatus) -> ReachGoal.Feedback:
-    """How far a goal is: by the newest state and by what the policy last said of itself."""
-    xy = (state.position.x, state.position.y)
-    feedback = ReachGoal.Feedback(
-        phase=ReachGoal.Feedback.WAITING,
-        distance_m=math.dist(xy, goal.xy),
-        steps=max(state.step - goal.first_step, 0) if state.episode_id == goal.episode_id else 0,
+def goal_message(header: Header, goal: Goal, *, active: bool, lease_s: float = 0.0) -> GoalQuery:
+    """A goal for the policy to act on, or that is over."""
+    return GoalQuery(
+        header=header,
+        query_id=goal.query_id,
+        episode_id=goal.episode_id,
+        active=active,
+        goal=to_floats(goal.observation),
+        position=to_point(goal.xy),
+        seed=goal.seed,
+        lease_s=lease_s,
     )
-    if policy.query_id == goal.query_id:
-        feedback.phase = {
-            PolicyStatus.ADAPTING: ReachGoal.Feedback.ADAPTING,
-            PolicyStatus.ACTING: ReachGoal.Feedback.DRIVING,
-        }.get(policy.phase, ReachGoal.Feedback.WAITING)
-        feedback.adapt_steps_done = policy.steps_done
-        feedback.adapt_steps = policy.steps
-        feedback.adapted = policy.adapted
-    return feedback
+
+
+def to_goal(message: GoalQuery) -> Goal:
+    """The goal of a message."""
+    return Goal(
+        query_id=message.query_id,
+        episode_id=message.episode_id,
+        observation=to_array(message.goal),
+        xy=(message.position.x, message.position.y),
+        seed=message.seed,
+    )
 
 
 def occupancy_grid(maze: MazeMap, header: Header) -> OccupancyGrid:
-    """A maze as a map of its cells, whose origin is the lower left corner of cell (0, 0)."""
+    """The occupancy grid of a maze; its origin is the lower left corner of cell (0, 0)."""
     grid = OccupancyGrid(header=header)
     xmin, _, ymin, _ = maze.extent
     rows, cols = maze.walls.shape

@@ -1,4 +1,4 @@
-"""What every node says of itself on /diagnostics."""
+"""Publisher of a node's health on /diagnostics."""
 
 from collections.abc import Callable
 
@@ -9,26 +9,15 @@ from rclpy.node import Node
 from metagcttt.health import Health
 
 
-def status_message(name: str, hardware_id: str, health: Health) -> DiagnosticStatus:
-    """A node's health as a message."""
-    return DiagnosticStatus(
-        level=bytes([health.level]),
-        name=name,
-        message=health.message,
-        hardware_id=hardware_id,
-        values=[KeyValue(key=key, value=value) for key, value in health.values.items()],
-    )
-
-
 class Diagnostics:
-    """Publishes a node's health once per period, whatever the node's clock does."""
+    """Publishes a node's health periodically, by a steady clock."""
 
     def __init__(self, node: Node, examine: Callable[[], Health], period_s: float) -> None:
-        """Begin.
+        """Create the publisher and its timer.
 
         Args:
             node: The node.
-            examine: Its health now.
+            examine: Returns its current health.
             period_s: Seconds between two messages.
         """
         self._node = node
@@ -39,8 +28,14 @@ class Diagnostics:
         self._timer = node.create_timer(period_s, self.publish, clock=steady)
 
     def publish(self) -> None:
-        """Say it now."""
-        name = self._node.get_fully_qualified_name()
-        message = DiagnosticArray(status=[status_message(name, '', self._examine())])
+        """Publish the current health."""
+        health = self._examine()
+        status = DiagnosticStatus(
+            level=bytes([health.level]),
+            name=self._node.get_fully_qualified_name(),
+            message=health.message,
+            values=[KeyValue(key=key, value=value) for key, value in health.values.items()],
+        )
+        message = DiagnosticArray(status=[status])
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)

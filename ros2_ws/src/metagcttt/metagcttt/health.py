@@ -1,4 +1,4 @@
-"""Figures and verdicts behind the diagnostics. No ROS in here."""
+"""Health of a node and the statistics behind it."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -11,7 +11,7 @@ MINUTE_S = 60.0
 
 
 class Level(IntEnum):
-    """As in diagnostic_msgs/DiagnosticStatus."""
+    """Severity, as in diagnostic_msgs/DiagnosticStatus."""
 
     OK = 0
     WARN = 1
@@ -20,7 +20,7 @@ class Level(IntEnum):
 
 @dataclass(frozen=True)
 class Health:
-    """How a node is: a level, why, and figures by name with their units."""
+    """Health of a node: a level, the reason, and values by name with their units."""
 
     level: Level
     message: str
@@ -28,41 +28,41 @@ class Health:
 
 
 class Samples:
-    """The last thousand values of something."""
+    """Most recent values of a quantity."""
 
     def __init__(self, size: int = 1000) -> None:
         """Keep the last `size` values."""
         self._values: deque[float] = deque(maxlen=size)
 
     def add(self, value: float) -> None:
-        """One more."""
+        """Record a value."""
         self._values.append(value)
 
     def percentile(self, percent: float) -> float:
-        """The value that `percent` of them do not exceed; 0 when there are none."""
+        """The percentile of the values; 0 when there are none."""
         return float(np.percentile(list(self._values), percent)) if self._values else 0.0
 
     def last(self) -> float:
-        """The newest; 0 when there are none."""
+        """The newest value; 0 when there are none."""
         return self._values[-1] if self._values else 0.0
 
 
 class Rate:
-    """How often something happens, over the last five seconds."""
+    """Rate of an event over the last five seconds."""
 
     def __init__(self) -> None:
-        """It has not happened yet."""
+        """Start without events."""
         self._times_s: deque[float] = deque()
         self.total = 0
 
     def add(self, now_s: float) -> None:
-        """It happened at `now_s`, seconds of a clock that only goes forward."""
+        """Record an event at `now_s`, seconds of a monotonic clock."""
         self._times_s.append(now_s)
         self.total += 1
         self._forget(now_s)
 
     def per_second(self, now_s: float) -> float:
-        """Its rate, hertz."""
+        """The rate in hertz."""
         self._forget(now_s)
         return len(self._times_s) / WINDOW_S
 
@@ -72,36 +72,36 @@ class Rate:
 
 
 class Deadlines:
-    """Counts control periods that went by without an action."""
+    """Counts control periods without an action."""
 
     def __init__(self) -> None:
-        """Nothing is missed before the first action."""
+        """Start without deadlines; the first action sets the first one."""
         self._last_s: float | None = None
         self._last_answered: tuple[int, int] | None = None
         self._missed: deque[tuple[float, int]] = deque()
         self.total = 0
 
     def met(self, now_s: float, period_s: float) -> None:
-        """An action went out; whole periods since the one before it, rounded, were missed."""
+        """Record an action; whole periods since the previous one, rounded, were missed."""
         if self._last_s is not None:
             self._miss(now_s, int((now_s - self._last_s) / period_s + 0.5) - 1)
         self._last_s = now_s
 
     def answered(self, now_s: float, episode_id: int, step: int) -> None:
-        """A state got its action; steps of the episode since the one before it were missed.
+        """Record the action for a state; the steps of the episode in between were missed.
 
-        For simulated time, which goes by in steps: the deadline of a state is the next one.
+        For simulated time, which advances in steps: the deadline of a state is the next one.
         """
         if self._last_answered is not None and self._last_answered[0] == episode_id:
             self._miss(now_s, step - self._last_answered[1] - 1)
         self._last_answered = (episode_id, step)
 
     def pause(self) -> None:
-        """No action is due before the next one."""
+        """Suspend the deadlines until the next action."""
         self._last_s = self._last_answered = None
 
     def in_last_minute(self, now_s: float) -> int:
-        """Number of misses in the last minute."""
+        """The number of periods missed in the last minute."""
         while self._missed and now_s - self._missed[0][0] > MINUTE_S:
             self._missed.popleft()
         return sum(missed for _, missed in self._missed)
@@ -113,19 +113,19 @@ class Deadlines:
 
 
 class Faults:
-    """What went wrong lately, so that no fault is too short to be reported."""
+    """Recent faults, kept for a while so that short ones are reported too."""
 
     def __init__(self) -> None:
-        """Nothing has."""
+        """Start without faults."""
         self.counts: dict[str, int] = {}
         self._newest = ('', float('-inf'))
 
     def note(self, kind: str, reason: str, now_s: float) -> None:
-        """A fault of a kind, such as `malformed_states`, with the reason in words."""
+        """Record a fault of a kind, such as `malformed_states`, with its reason."""
         self.counts[kind] = self.counts.get(kind, 0) + 1
         self._newest = (reason, now_s)
 
     def recent(self, now_s: float, memory_s: float = 1.0) -> str:
-        """The newest fault when it is not older than `memory_s`; else empty."""
+        """The reason of the newest fault; empty when it is older than `memory_s`."""
         reason, time_s = self._newest
         return reason if now_s - time_s <= memory_s else ''

@@ -1,4 +1,4 @@
-"""What the launch files have in common. Imports launch, which the nodes do without."""
+"""Arguments of the launch files. Imports launch, which the nodes do not need."""
 
 from typing import Any
 
@@ -15,8 +15,8 @@ _ARGUMENTS: dict[str, dict[str, Any]] = {
     'stepping': {
         'default_value': 'realtime',
         'choices': ['realtime', 'lockstep'],
-        'description': 'whether the world goes on by itself or waits for every action; '
-        'chooses the parameter file',
+        'description': 'whether the simulator steps on its own or waits for every action; '
+        'selects the parameter file',
     },
     'params_file': {
         'default_value': [
@@ -27,13 +27,16 @@ _ARGUMENTS: dict[str, dict[str, Any]] = {
     },
     'environment': {
         'default_value': 'pointmaze-medium-v0',
-        'description': 'name of the maze, as sim_bridge knows it',
+        'description': 'name of the maze in sim_bridge',
     },
     'checkpoint': {
         'default_value': '',
-        'description': 'folder of the policy; empty: committed one',
+        'description': 'folder of the policy; empty: the committed one',
     },
-    'dataset': {'default_value': '', 'description': 'dataset file (.npz); empty: committed one'},
+    'dataset': {
+        'default_value': '',
+        'description': 'dataset file (.npz); empty: the committed one',
+    },
     'autostart': {
         'default_value': 'true',
         'choices': _FLAG,
@@ -46,24 +49,24 @@ _ARGUMENTS: dict[str, dict[str, Any]] = {
     },
     'clock_topic': {
         'default_value': '/clock',
-        'description': 'topic of the simulated time; relative for one in the namespace, so that '
-        'several robots have times of their own',
+        'description': 'topic of the simulated time; a relative name is in the namespace, so that '
+        'each robot has its own time',
     },
     'policy': {
         'default_value': 'true',
         'choices': _FLAG,
-        'description': 'whether to start the policy node; false where something else does',
+        'description': 'whether to start the policy node; false when something else starts it',
     },
     'record': {'default_value': '', 'description': 'file (.mcap) to record to; empty: none'},
     'visualize': {
         'default_value': 'false',
         'choices': _FLAG,
-        'description': 'whether to publish odom, path and markers; RViz shows them',
+        'description': 'whether to publish odom, path and markers for RViz',
     },
     'rviz': {
         'default_value': 'false',
         'choices': _FLAG,
-        'description': 'whether to start RViz, which has to be installed',
+        'description': 'whether to start RViz, which must be installed',
     },
     'log_level': {
         'default_value': 'info',
@@ -74,12 +77,12 @@ _ARGUMENTS: dict[str, dict[str, Any]] = {
 
 
 def declare(*names: str) -> list[DeclareLaunchArgument]:
-    """Declarations of arguments by their names; all there are when none is named."""
+    """Declarations of the named arguments, or of all."""
     return [DeclareLaunchArgument(name, **_ARGUMENTS[name]) for name in names or _ARGUMENTS]
 
 
 def text(argument: str) -> ParameterValue:
-    """A launch argument as a string parameter; a bare substitution is read as YAML."""
+    """A launch argument as a string parameter; a bare substitution would be read as YAML."""
     return ParameterValue(LaunchConfiguration(argument), value_type=str)
 
 

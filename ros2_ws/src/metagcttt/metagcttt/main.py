@@ -1,84 +1,73 @@
-"""The executables. What takes long to import waits until signals are handled."""
+"""Entry points of the executables. Slow imports wait until signals are handled."""
 
 from collections.abc import Callable
+from functools import wraps
 import gc
-from typing import Any, TYPE_CHECKING
+import threading
 
 from metagcttt.signals import stop_on_signals
 
-if TYPE_CHECKING:
-    from rclpy.node import Node
+
+def _executable(main: Callable[[threading.Event], int]) -> Callable[[], int]:
+    """An entry point that hands `main` the event set by Ctrl-C and SIGTERM."""
+
+    @wraps(main)
+    def run_main() -> int:
+        stop = stop_on_signals()
+        try:
+            return main(stop)
+        except ImportError:
+            # Compiled modules turn the exception that a signal raises into this.
+            if not stop.is_set():
+                raise
+            return 0
+        finally:
+            # A garbage collection at exit, over all that PyTorch imported, takes up to seconds.
+            gc.freeze()
+
+    return run_main
 
 
-def goal_node() -> int:
+@_executable
+def goal_node(stop: threading.Event) -> int:
     """Run the goal node until Ctrl-C or SIGTERM; returns the exit code."""
+    from metagcttt.goal.node import GoalNode
+    from metagcttt.running import run
 
-    def load() -> Callable[[], 'Node']:
-        from metagcttt.goal.node import GoalNode
-
-        return GoalNode
-
-    return _main(load, farewell=lambda node: node.end_service())
+    return run(GoalNode, stop, farewell=GoalNode.end_service)
 
 
-def policy_node() -> int:
+@_executable
+def policy_node(stop: threading.Event) -> int:
     """Run the policy node until Ctrl-C or SIGTERM; returns the exit code."""
+    from metagcttt.policy.node import PolicyNode
+    from metagcttt.running import run
 
-    def load() -> Callable[[], 'Node']:
-        from metagcttt.policy.node import PolicyNode
-
-        return PolicyNode
-
-    return _main(load)
+    return run(PolicyNode, stop)
 
 
-def recorder_node() -> int:
-    """Run the recorder until Ctrl-C or SIGTERM; returns the exit code."""
+@_executable
+def recorder_node(stop: threading.Event) -> int:
+    """Run the recorder node until Ctrl-C or SIGTERM; returns the exit code."""
+    from metagcttt.recorder.node import RecorderNode
+    from metagcttt.running import run
 
-    def load() -> Callable[[], 'Node']:
-        from metagcttt.recorder.node import RecorderNode
-
-        return RecorderNode
-
-    return _main(load)
+    return run(RecorderNode, stop)
 
 
-def sim_bridge_node() -> int:
-    """Run the simulator's bridge until Ctrl-C or SIGTERM; returns the exit code."""
+@_executable
+def sim_bridge_node(stop: threading.Event) -> int:
+    """Run the simulator bridge until Ctrl-C or SIGTERM; returns the exit code."""
+    from metagcttt.running import run
+    from metagcttt.sim.node import SimBridgeNode
 
-    def load() -> Callable[[], 'Node']:
-        from metagcttt.sim.node import SimBridgeNode
-
-        return SimBridgeNode
-
-    return _main(load)
+    return run(SimBridgeNode, stop)
 
 
-def visualization_node() -> int:
+@_executable
+def visualization_node(stop: threading.Event) -> int:
     """Run the visualization node until Ctrl-C or SIGTERM; returns the exit code."""
+    from metagcttt.running import run
+    from metagcttt.visualization.node import VisualizationNode
 
-    def load() -> Callable[[], 'Node']:
-        from metagcttt.visualization.node import VisualizationNode
-
-        return VisualizationNode
-
-    return _main(load)
-
-
-def _main(
-    load: Callable[[], Callable[[], 'Node']], farewell: Callable[[Any], None] | None = None
-) -> int:
-    stop = stop_on_signals()
-    try:
-        make_node = load()
-        from metagcttt.running import run
-
-        return run(make_node, stop, farewell)
-    except ImportError:
-        # Compiled modules turn what a signal raises into this.
-        if not stop.is_set():
-            raise
-        return 0
-    finally:
-        # At the exit, to look for garbage in all that PyTorch has imported takes up to seconds.
-        gc.freeze()
+    return run(VisualizationNode, stop)

@@ -1,4 +1,4 @@
-"""How parameters are declared and checked; the tables are in `parameters`."""
+"""Declaration and checks of node parameters; the tables are in `parameters`."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class Parameter:
         name: Its name; carries the unit when that is not obvious.
         default: Its default; decides the type.
         description: What it does, with its unit and what special values mean.
-        minimum, maximum: Inclusive range of a number.
+        limits: Inclusive range of a number.
         choices: Accepted strings; any when empty.
         changes: When a change takes effect. `start`: never after the start, the parameter is
             read-only; `configure`: at the next configuration, so only an unconfigured node
@@ -34,29 +34,27 @@ class Parameter:
     name: str
     default: Value
     description: str
-    minimum: float | None = None
-    maximum: float | None = None
+    limits: tuple[float, float] | None = None
     choices: tuple[str, ...] = ()
     changes: Literal['start', 'configure', 'now'] = 'start'
 
     def descriptor(self) -> ParameterDescriptor:
-        """What `ros2 param describe` shows; rclpy enforces the range and read-only."""
+        """The descriptor that `ros2 param describe` shows; rclpy enforces range and read-only."""
         descriptor = ParameterDescriptor(
             name=self.name,
             description=self.description,
             additional_constraints=self.accepted() if self.choices else '',
             read_only=self.changes == 'start',
         )
-        if self.minimum is not None and self.maximum is not None:
+        if self.limits is not None:
+            low, high = self.limits
             if isinstance(self.default, int):
                 descriptor.integer_range = [
-                    IntegerRange(from_value=int(self.minimum), to_value=int(self.maximum), step=1)
+                    IntegerRange(from_value=int(low), to_value=int(high), step=1)
                 ]
             else:
                 descriptor.floating_point_range = [
-                    FloatingPointRange(
-                        from_value=float(self.minimum), to_value=float(self.maximum), step=0.0
-                    )
+                    FloatingPointRange(from_value=float(low), to_value=float(high), step=0.0)
                 ]
         return descriptor
 
@@ -64,38 +62,39 @@ class Parameter:
         """The accepted values, in words."""
         if self.choices:
             return 'one of ' + ', '.join(self.choices)
-        if self.minimum is not None:
+        if self.limits is not None:
             form = 'd' if isinstance(self.default, int) else 'g'
-            return f'{self.minimum:{form}} to {self.maximum:{form}}'
+            low, high = self.limits
+            return f'{low:{form}} to {high:{form}}'
         return {bool: 'true, false', str: 'any text'}[type(self.default)]
 
     def refusal(self, value: Any) -> str:
-        """Why `value` cannot be taken, beyond what the descriptor says; empty when it can."""
+        """The reason to reject `value`, beyond the descriptor's; empty to accept it."""
         if self.choices and value not in self.choices:
             return f'{self.name} must be {self.accepted()}, got {value!r}'
         return ''
 
 
 class ParameterSet:
-    """A node's parameters: declares a table and refuses what the table does not allow."""
+    """The parameters of a node, declared from a table and checked against it."""
 
     def __init__(
         self, node: Node, table: Iterable[Parameter], is_configured: Callable[[], bool]
     ) -> None:
-        """Declare `table` on `node`; overrides from the command line are checked as well.
+        """Declare `table` on `node`; overrides from the command line are checked too.
 
         Args:
             node: The node.
             table: Its parameters.
-            is_configured: Whether what is read at configuration is in use now.
+            is_configured: Whether the node is configured now.
 
         Raises:
-            rclpy.exceptions.InvalidParameterValueException: For an override that is refused.
+            rclpy.exceptions.InvalidParameterValueException: For an override that is rejected.
         """
         self._node = node
         self._table = {parameter.name: parameter for parameter in table}
         self._is_configured = is_configured
-        # Before the declarations, which it checks too.
+        # First, so that it checks the declarations too.
         node.add_on_set_parameters_callback(self._check)
         for parameter in self._table.values():
             node.declare_parameter(parameter.name, parameter.default, parameter.descriptor())
@@ -107,7 +106,7 @@ class ParameterSet:
     def _check(self, changes: list[RosParameter]) -> SetParametersResult:
         for change in changes:
             parameter = self._table.get(change.name)
-            if parameter is None:  # rclpy's own, such as use_sim_time
+            if parameter is None:  # one of rclpy's own, such as use_sim_time
                 continue
             reason = parameter.refusal(change.value)
             if not reason and parameter.changes == 'configure' and self._is_configured():

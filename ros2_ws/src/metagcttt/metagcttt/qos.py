@@ -1,4 +1,4 @@
-"""The qualities of service that the topics use."""
+"""QoS profiles of the topics."""
 
 from collections.abc import Sequence
 
@@ -10,7 +10,7 @@ SENSOR = QoSProfile(
     reliability=ReliabilityPolicy.BEST_EFFORT,
     durability=DurabilityPolicy.VOLATILE,
 )
-"""The newest value matters, a lost one does not."""
+"""For streams whose newest value matters and whose lost ones do not."""
 
 COMMAND = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
@@ -18,7 +18,7 @@ COMMAND = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.VOLATILE,
 )
-"""Arrives, but a newer one wins."""
+"""For commands: delivered, and superseded by newer ones."""
 
 LATCHED = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
@@ -26,7 +26,7 @@ LATCHED = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
-"""What holds until it is replaced; whoever joins later gets it too."""
+"""For values that hold until they are replaced; late joiners get them too."""
 
 EVENTS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
@@ -34,23 +34,23 @@ EVENTS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
-"""Every one counts, also the few before one joined; a depth of 1 would lose the first of two."""
+"""For events, which all count, also to late joiners; a depth of 1 would lose the first of two."""
 
 
 def state_profile(stepping: str) -> QoSProfile:
-    """The profile of `state`: in lockstep the world stands still until a state is answered."""
+    """The profile of `state`; in lockstep the simulator waits for the answer to every state."""
     return LATCHED if stepping == 'lockstep' else SENSOR
 
 
 RECORDED_DEPTH = 1000
-"""Messages that wait for a recorder: in lockstep those of a second or more."""
+"""Messages kept for a slow reader such as the recorder; in lockstep a second's or more."""
 
 
 def keep_several(profile: QoSProfile, depth: int = 20) -> QoSProfile:
-    """The same with a larger depth, for one end of a topic on which every message counts.
+    """The profile with a larger depth, for one end of a topic on which every message counts.
 
-    With a depth of 1 a newer message takes the place of one that was not read yet: a slow recorder
-    would miss some, and of two senders one would not be noticed.
+    With a depth of 1 a newer message replaces one that was not read yet: a slow recorder would
+    miss some, and one of two senders would go unnoticed.
     """
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
@@ -61,7 +61,7 @@ def keep_several(profile: QoSProfile, depth: int = 20) -> QoSProfile:
 
 
 def recording_profile(publishers: Sequence[QoSProfile]) -> QoSProfile:
-    """The best quality that all publishers of a topic offer; nothing waits to be taken in vain."""
+    """The strictest profile that all publishers of a topic offer."""
     reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in publishers)
     latched = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers)
     return QoSProfile(

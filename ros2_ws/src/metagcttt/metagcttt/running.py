@@ -1,4 +1,4 @@
-"""Run one node as a process that ends cleanly."""
+"""A node as a process that ends cleanly."""
 
 from collections.abc import Callable
 import threading
@@ -24,20 +24,20 @@ def run(
     stop: threading.Event,
     farewell: Callable[[AnyNode], None] | None = None,
 ) -> int:
-    """Spin a node until `stop` is set and take everything down in the order that leaves no error.
+    """Spin a node until `stop` is set and shut everything down in the order that leaves no error.
 
     Args:
-        make_node: Makes the node. Its `destroy_node` has to join the threads it started.
+        make_node: Creates the node, whose `destroy_node` must join the threads it started.
         stop: From `stop_on_signals`.
-        farewell: Says goodbye to those who rely on the node, which is spun a moment longer.
+        farewell: Called at the end; the node is then spun a moment longer, to send its messages.
 
     Returns:
-        Exit code: 0 after a stop, 1 when the node could not be made; the log says why.
+        Exit code: 0 after a stop, 1 when the node could not be created; the log says why.
 
     Raises:
-        SystemExit: With code 0, by a signal while the node is made.
+        SystemExit: With code 0, by a signal while the node is created.
     """
-    # rclpy's own handlers shut the context down under the executor's feet.
+    # rclpy's own handlers shut the context down while the executor uses it.
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:
         try:

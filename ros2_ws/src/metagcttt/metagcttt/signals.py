@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM from the first moment on. Imports nothing that takes long."""
+"""Handlers of Ctrl-C and SIGTERM from start-up on. Imports nothing slow."""
 
 import signal
 import threading
@@ -8,18 +8,18 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def stop_on_signals() -> threading.Event:
-    """Let Ctrl-C and SIGTERM end the process cleanly from now on.
+    """Handle Ctrl-C and SIGTERM so that they end the process cleanly.
 
-    During the start they raise SystemExit(0), because an import or the loading of a policy may
-    take longer than anybody waits for an end; `only_set` ends that phase.
+    During start-up they raise SystemExit(0), because an import or the loading of a policy may
+    take seconds; `only_set` ends that phase.
 
     Returns:
-        An event that they set as well.
+        An event that they set too.
     """
     stop = threading.Event()
 
     def end_the_start(signum: int, frame: FrameType | None) -> None:
-        stop.set()  # should somebody on the way swallow the exception
+        stop.set()  # in case the exception is swallowed on its way
         raise SystemExit(0)
 
     for number in SIGNALS:
@@ -28,7 +28,7 @@ def stop_on_signals() -> threading.Event:
 
 
 def only_set(stop: threading.Event) -> None:
-    """From now on the signals do no more than set `stop`, which somebody looks at all the time."""
+    """Make the signals only set `stop`, which the spinning loop polls."""
 
     def request_stop(signum: int, frame: FrameType | None) -> None:
         stop.set()
@@ -38,6 +38,6 @@ def only_set(stop: threading.Event) -> None:
 
 
 def ignore_signals() -> None:
-    """From now on they do nothing: the end is under way."""
+    """Ignore the signals, as the shutdown is under way."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)

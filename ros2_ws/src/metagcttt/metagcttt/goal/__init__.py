@@ -1,1 +1,1 @@
-"""Goals on the graph: checks them, numbers them and decides when they are over."""
+"""The goal node: checks and numbers goals, and decides when they end."""

@@ -1,4 +1,4 @@
-"""What makes a goal acceptable, and when it is over. No ROS in here."""
+"""Accepted goals, the check of a goal against the maze, and the end of a goal."""
 
 from dataclasses import dataclass
 import math
@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sim_bridge import MazeDescription
 
-from metagcttt.vectors import vector_fault
+from metagcttt.goal_in_force import Goal
+from metagcttt.input_checks import vector_fault
 
 Error = Literal[
     'NONE',
@@ -33,46 +34,55 @@ Error = Literal[
 
 @dataclass(frozen=True)
 class Verdict:
-    """Why a goal is refused, or how it ended; `reason` is for people."""
+    """The reason why a goal is refused, or how it ended: a code and the words."""
 
     error: Error
     reason: str
 
 
 @dataclass(frozen=True)
-class Goal:
-    """An accepted goal.
+class AcceptedGoal(Goal):
+    """A goal with what decides about its end and what its sender is told.
 
     Attributes:
-        query_id: Its number.
-        episode_id: The episode in which it counts.
-        observation: Full goal observation, shape (obs_dim,), float64.
-        xy: Its position in metres.
-        seed: Seed of the adaptation to it.
-        first_step: Control step of the episode at which it was accepted.
+        first_step: Control step of the episode from which its steps count.
         is_task: Whether it is the goal of the episode's own task.
         max_steps: Control steps that it may take; 0 for the goal node's own limit.
         request_id: Name that the sender of an action goal gave it.
-        accepted_ns: When it was accepted, nanoseconds of the goal node's clock.
+        accepted_s: Time of acceptance, seconds of the goal node's clock.
     """
 
-    query_id: int
-    episode_id: int
-    observation: NDArray[np.float64]
-    xy: tuple[float, float]
-    seed: int
     first_step: int
-    is_task: bool
+    is_task: bool = False
     max_steps: int = 0
     request_id: str = ''
-    accepted_ns: int = 0
+    accepted_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class RobotState:
+    """A state of the robot in an episode, as far as it decides about goals.
+
+    Attributes:
+        episode_id: Its episode.
+        step: Its control step.
+        xy: The robot's position in metres.
+        ended: Whether the episode ended with this state.
+        success: Whether the robot is at the goal of the episode's task, as the simulator judges.
+    """
+
+    episode_id: int
+    step: int
+    xy: tuple[float, float]
+    ended: bool = False
+    success: bool = False
 
 
 class GoalCatalog:
     """Checks positions against a maze and completes them to goal observations."""
 
     def __init__(self, description: MazeDescription, trajectory_filter: TrajectoryFilter) -> None:
-        """Use a maze and a dataset that was recorded in it.
+        """Create the catalog of a maze and a dataset recorded in it.
 
         Raises:
             ValueError: If the dataset has other observations than the maze.
@@ -88,7 +98,7 @@ class GoalCatalog:
         self._filter = trajectory_filter
 
     def refusal(self, x: float, y: float) -> Verdict | None:
-        """Why the position (x, y), in metres, cannot be a goal; None when it can."""
+        """The reason why the position (x, y), in metres, cannot be a goal; None when it can."""
         if not (math.isfinite(x) and math.isfinite(y)):
             return Verdict('NOT_FINITE', f'the position ({x}, {y}) is not finite')
         if not self._maze.contains(x, y):
@@ -104,7 +114,7 @@ class GoalCatalog:
         return None
 
     def observation_refusal(self, observation: NDArray[np.float64]) -> Verdict | None:
-        """Why a full goal observation, shape (n,), cannot be a goal; None when it can."""
+        """The reason why a goal observation, shape (n,), cannot be a goal; None when it can."""
         fault = vector_fault('the goal', observation, self._filter.dataset.obs_dim)
         if fault:
             wrong_size = observation.shape != (self._filter.dataset.obs_dim,)
@@ -114,7 +124,7 @@ class GoalCatalog:
     def complete(self, x: float, y: float) -> NDArray[np.float64]:
         """A goal observation at the position (x, y), in metres, shape (obs_dim,), float64.
 
-        Everything but the position is taken from the dataset's state nearest to it.
+        The other values are those of the dataset's state nearest to the position.
         """
         row = self._filter.nearest_row(np.array((x, y)))
         observation = np.array(self._filter.dataset.observations[row], dtype=np.float64)
@@ -122,42 +132,32 @@ class GoalCatalog:
         return observation
 
     def position(self, observation: NDArray[np.float64]) -> tuple[float, float]:
-        """Where x and y, in metres, stand in an observation of shape (obs_dim,)."""
+        """The position (x, y), in metres, in an observation of shape (obs_dim,)."""
         x, y = observation[self._position_dims]
         return float(x), float(y)
 
 
 def goal_ending(
-    goal: Goal,
-    *,
-    xy: tuple[float, float],
-    step: int,
-    ended: bool,
-    success: bool,
-    tolerance_m: float,
-    max_steps: int,
+    goal: AcceptedGoal, state: RobotState, *, tolerance_m: float, max_steps: int
 ) -> Verdict | None:
-    """Whether a goal is over in a state of its episode.
+    """The ending of a goal in a state of its episode; None while it is under way.
 
     Args:
         goal: The goal.
-        xy: The agent's position in metres.
-        step: Control step of the state.
-        ended: The episode ended with this state.
-        success: The agent is at the goal of the episode's task, by the simulator's own measure.
+        state: The state.
         tolerance_m: Distance within which a goal is reached, metres.
-        max_steps: Control steps that a goal may take.
+        max_steps: Control steps that a goal may take unless it says otherwise.
 
     Returns:
-        How it ended, error `NONE` when it was reached, or None while it is under way.
+        The verdict, with error `NONE` when the goal was reached.
     """
-    steps = step - goal.first_step
-    distance_m = math.dist(xy, goal.xy)
-    if distance_m <= tolerance_m or (goal.is_task and success):
+    steps = state.step - goal.first_step
+    distance_m = math.dist(state.xy, goal.xy)
+    if distance_m <= tolerance_m or (goal.is_task and state.success):
         return Verdict('NONE', f'after {steps} steps, {distance_m:.2f} m from the goal')
-    if steps >= max_steps:
+    if steps >= (goal.max_steps or max_steps):
         reason = f'not reached in {steps} steps, {distance_m:.2f} m from the goal'
         return Verdict('TIMED_OUT', reason)
-    if ended:
+    if state.ended:
         return Verdict('EPISODE_ENDED', f'the episode ended {distance_m:.2f} m from the goal')
     return None

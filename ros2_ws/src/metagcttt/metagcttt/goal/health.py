@@ -1,44 +1,44 @@
-"""How a goal node is. No ROS in here."""
+"""Health of the goal node."""
 
 from collections import Counter
 import time
 
-from metagcttt.goal.goals import Goal
+from metagcttt.goal_in_force import Goal
 from metagcttt.health import Faults, Health, Level, Rate
 
 
 class GoalMonitor:
-    """Gathers figures while goals come and go, and judges them.
+    """Collects statistics on goals and states, and judges the health of the goal node.
 
     Attributes:
-        counts: Goals that ended or were refused, by the name of the error; `NONE`: reached.
+        counts: Goals that ended or were rejected, by the name of the error; `NONE`: reached.
     """
 
     def __init__(self) -> None:
-        """Nothing has happened yet."""
+        """Start with empty statistics."""
         self.counts: Counter[str] = Counter()
         self._states = Rate()
         self._faults = Faults()
         self._policy_s = float('-inf')
 
     def saw_state(self, fault: str) -> None:
-        """A state arrived; `fault` says why it is not used."""
+        """Record a state; `fault` is the reason why it is ignored, empty when it is used."""
         now_s = time.monotonic()
         self._states.add(now_s)
         if fault:
             self._faults.note('unusable_states', fault, now_s)
 
     def saw_policy(self) -> None:
-        """The policy said that it is there."""
+        """Record a status message of the policy."""
         self._policy_s = time.monotonic()
 
     def examine(self, goal: Goal | None, *, has_source: bool, policy_timeout_s: float) -> Health:
-        """The health now.
+        """The current health.
 
         Args:
             goal: The goal in force, if any.
             has_source: Whether anybody publishes states.
-            policy_timeout_s: How long a policy may be silent while there is a goal, seconds.
+            policy_timeout_s: Longest silence of the policy while a goal is in force, seconds.
         """
         now_s = time.monotonic()
         values = {
@@ -53,5 +53,5 @@ class GoalMonitor:
         elif recent := self._faults.recent(now_s):
             level, message = Level.ERROR, f'a state was ignored: {recent}'
         elif goal and now_s - self._policy_s > policy_timeout_s:
-            level, message = Level.WARN, 'a goal is in force, but no policy is to be heard'
+            level, message = Level.WARN, 'a goal is in force, but no policy status is received'
         return Health(level, message, values)

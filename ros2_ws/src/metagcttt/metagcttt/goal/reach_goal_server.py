@@ -1,37 +1,65 @@
-"""The `reach_goal` action: one goal of it at a time is under way."""
+"""Server of the `reach_goal` action, with one goal under way at a time."""
 
 from collections.abc import Callable
+import math
 import time
 
 from metagcttt_interfaces.action import ReachGoal
+from metagcttt_interfaces.msg import PolicyStatus
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
-from metagcttt.goal.goals import Verdict
+from metagcttt.goal.goals import AcceptedGoal, RobotState
+from metagcttt.goal.tracker import Ended
 
 FEEDBACK_PERIOD_S = 0.1
 
 
-class _DeferredActionServer(ActionServer):
-    """An action server whose results are given when they are known.
+def feedback_message(
+    goal: AcceptedGoal, state: RobotState | None, policy: PolicyStatus
+) -> ReachGoal.Feedback:
+    """The progress towards a goal, by the newest state and the policy's newest status.
 
-    The execute callback that rclpy asks for would occupy a thread, or, as a coroutine, wake the
-    executor all the time, until the robot has arrived.
+    Args:
+        goal: The goal in force.
+        state: The newest state of its episode; None before the first, when the distance is NaN.
+        policy: What the policy last reported, perhaps on another goal.
+    """
+    feedback = ReachGoal.Feedback(phase=ReachGoal.Feedback.WAITING, distance_m=math.nan)
+    if state is not None:
+        feedback.distance_m = math.dist(state.xy, goal.xy)
+        feedback.steps = max(state.step - goal.first_step, 0)
+    if policy.query_id == goal.query_id:
+        feedback.phase = {
+            PolicyStatus.ADAPTING: ReachGoal.Feedback.ADAPTING,
+            PolicyStatus.ACTING: ReachGoal.Feedback.DRIVING,
+        }.get(policy.phase, ReachGoal.Feedback.WAITING)
+        feedback.adapt_steps_done = policy.steps_done
+        feedback.adapt_steps = policy.steps
+        feedback.adapted = policy.adapted
+    return feedback
+
+
+class _DeferredActionServer(ActionServer):
+    """An action server that sends results when they are known, without an execute callback.
+
+    Until the robot has arrived, the callback that rclpy asks for would occupy a thread or, as a
+    coroutine, keep waking the executor.
     """
 
     def notify_execute(
         self, goal_handle: ServerGoalHandle, execute_callback: Callable | None
     ) -> None:
-        """A goal begins; nothing to compute."""
+        """Ignore the start of a goal, which needs no computation."""
 
     def give_result(self, goal_handle: ServerGoalHandle, result: ReachGoal.Result) -> None:
-        """Send the result of a goal that was marked as ended."""
+        """Send the result of a goal whose final state is set."""
         super().notify_execute(goal_handle, lambda _: result)
 
 
 class ReachGoalServer:
-    """Speaks the protocol of the action; what becomes of goals is decided by its owner."""
+    """Implements the protocol of the action; its owner decides about goals."""
 
     def __init__(
         self,
@@ -41,14 +69,13 @@ class ReachGoalServer:
         begin: Callable[[ReachGoal.Goal], None],
         cancel: Callable[[], None],
     ) -> None:
-        """Offer the action.
+        """Create the action server.
 
         Args:
-            node: The node to offer it through.
-            is_acceptable: Whether a request is taken; says why if not.
-            begin: Takes up a request that was acceptable, after calling `finish` for what it
-                replaces.
-            cancel: Ends the goal under way, calling `finish`.
+            node: The node that owns it.
+            is_acceptable: Whether a request is accepted; publishes the reason if not.
+            begin: Puts an acceptable request in force, after `finish` for the goal it replaces.
+            cancel: Ends the goal under way, with `finish`.
         """
         self._node = node
         self._is_acceptable = is_acceptable
@@ -68,15 +95,16 @@ class ReachGoalServer:
         )
 
     def report(self, feedback: ReachGoal.Feedback) -> None:
-        """Tell the sender how far the goal is, at once when the phase changes."""
+        """Send feedback, at its own rate and whenever the phase changes."""
         now_s = time.monotonic()
         due = now_s - self._last_feedback_s >= FEEDBACK_PERIOD_S
         if self._handle is not None and (due or feedback.phase != self._last_feedback.phase):
             self._last_feedback, self._last_feedback_s = feedback, now_s
             self._handle.publish_feedback(feedback)
 
-    def finish(self, verdict: Verdict, steps: int, seconds: float) -> None:
+    def finish(self, ended: Ended) -> None:
         """Send the result of the goal under way, if it is one of this action."""
+        verdict = ended.verdict
         handle, self._handle = self._handle, None
         if handle is None:
             return
@@ -88,15 +116,15 @@ class ReachGoalServer:
             handle.abort()
         result = ReachGoal.Result(
             success=verdict.error == 'NONE',
-            steps=steps,
-            seconds=seconds,
+            steps=ended.step - ended.goal.first_step,
+            seconds=ended.seconds,
             error_code=getattr(ReachGoal.Result, verdict.error),
             error_msg='' if verdict.error == 'NONE' else verdict.reason,
         )
         self._server.give_result(handle, result)
 
     def destroy(self) -> None:
-        """Withdraw the action."""
+        """Destroy the action server."""
         self._server.destroy()
 
     def _on_request(self, request: ReachGoal.Goal) -> GoalResponse:
@@ -110,7 +138,7 @@ class ReachGoalServer:
     def _on_cancel(self, handle: ServerGoalHandle) -> CancelResponse:
         # rclpy marks the goal as being canceled after this returns.
         executor = self._node.executor
-        assert executor is not None, 'it calls this'
+        assert executor is not None, 'the caller'
         executor.create_task(self._finish_cancel, handle)
         return CancelResponse.ACCEPT
 

@@ -1,1 +1,1 @@
-"""The policy on the graph: filters, adapts for K steps per goal and acts."""
+"""The policy node: filters the dataset, adapts for K steps per goal and acts."""

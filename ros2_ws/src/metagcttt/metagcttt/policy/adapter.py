@@ -1,28 +1,30 @@
-"""Adapts a policy to queries beside the control loop."""
+"""Adaptation to goals beside the control loop."""
 
-from collections.abc import Callable
-from concurrent.futures import Future
+from collections.abc import Callable, Hashable
+from concurrent.futures import CancelledError, Future
 from functools import partial
+from typing import Any
 
+from metagcttt_core import Adaptation
 from metagcttt_core.adaptation import AdaptationCancelled
 from rclpy.lifecycle import LifecycleNode
 
 from metagcttt.parameter_set import ParameterSet
-from metagcttt.policy.deployment import answer_query, Deployment, foresee_values, Outcome
+from metagcttt.policy.decision import Progress, Pursuit, State
+from metagcttt.policy.deployment import adapt_to_goal, Deployment, prefetch_values
 from metagcttt.policy.expert_cache import ExpertCache
 from metagcttt.policy.health import PolicyMonitor
-from metagcttt.policy.pilot import Query, State
-from metagcttt.policy.publishers import PolicyAnnouncer
+from metagcttt.policy.publishers import PolicyPublishers
 from metagcttt.policy.worker import AdaptationWorker
 
 CANCELLED = 'cancelled by a newer goal, a newer episode or a stop'
 
 
-class QueryAdapter:
-    """Gives queries their experts and reports how that went.
+class GoalAdapter:
+    """Adapts to goals and reports the results.
 
-    Gradient steps are taken in a thread of their own; queries are changed in the thread that spins
-    the node only. Between two adaptations to a goal, which there are with a horizon, that thread
+    Gradient steps are taken in a background thread; a `Pursuit` is changed only in the thread that
+    spins the node. Between two adaptations to one goal (with a horizon) the background thread
     evaluates the critic for the next one.
     """
 
@@ -31,27 +33,27 @@ class QueryAdapter:
         node: LifecycleNode,
         settings: ParameterSet,
         deployment: Deployment,
-        announcer: PolicyAnnouncer,
+        publishers: PolicyPublishers,
         monitor: PolicyMonitor,
         on_ended: Callable[[], None],
     ) -> None:
-        """Adapt to nothing yet.
+        """Start the background thread.
 
         Args:
-            node: Whose thread takes the experts over.
+            node: The node whose thread receives the experts.
             settings: Its parameters.
             deployment: Policy and dataset.
-            announcer: Publishes the reports.
-            monitor: Gathers the figures.
+            publishers: For the reports.
+            monitor: For the diagnostics.
             on_ended: Called when adaptations have ended.
         """
         self._node = node
         self._deployment = deployment
-        self._announcer = announcer
+        self._publishers = publishers
         self._monitor = monitor
         self._on_ended = on_ended
         self._finished = node.create_guard_condition(self._on_finished)
-        self._worker: AdaptationWorker[Query | None, Outcome | None] = AdaptationWorker(
+        self._worker: AdaptationWorker[Callable[[Future[Any]], None], Any] = AdaptationWorker(
             self._finished.trigger, settings['threads']
         )
         self._cache = ExpertCache(
@@ -62,77 +64,73 @@ class QueryAdapter:
 
     @property
     def num_pending(self) -> int:
-        """Jobs whose end was not seen yet."""
+        """Number of jobs whose result was not handled yet."""
         return self._worker.num_pending
 
-    def adapt(self, query: Query, state: State) -> None:
-        """Adapt to a query in a state, in place of what is under way."""
-        query.adapted_at = state.step
-        query.cache_key = self._cache.key(state.observation, query.goal, query.config)
-        known = self._cache.find(query.cache_key)
-        if known is not None:
-            self._conclude(query, known, cached=True)
+    def adapt(self, pursuit: Pursuit, state: State) -> None:
+        """Adapt to a goal from a state; cancels the adaptation under way."""
+        goal, config = pursuit.goal, pursuit.config
+        pursuit.adapted_at = state.step
+        key = self._cache.key(state.observation, goal.observation, config)
+        cached = self._cache.find(key)
+        if cached is not None:
+            self._conclude(pursuit, cached, cached=True)
             return
-        answer = partial(
-            answer_query,
+        pursuit.progress = Progress()
+        job = partial(
+            adapt_to_goal,
             self._deployment,
             state.observation,
-            query.goal,
-            query.config,
-            query.seed,
-            on_step=partial(setattr, query, 'steps_done'),
+            goal,
+            config,
+            on_step=pursuit.progress,
         )
-        if query.config.steps == 0:
-            self._conclude(query, answer(lambda: False))
+        if config.steps == 0:
+            self._conclude(pursuit, job(lambda: False))
         else:
-            query.adapting, query.steps_done = True, 0
-            self._worker.start(query, answer)
+            pursuit.adapting = True
+            self._worker.start(partial(self._on_adapted, pursuit, key), job)
 
     def cancel(self) -> None:
-        """Give up the adaptation under way, within one gradient step."""
+        """Cancel the adaptation under way, within one gradient step."""
         self._worker.cancel()
 
     def close(self) -> None:
-        """Give up and end the thread."""
+        """Cancel and join the background thread."""
         self._worker.close()
         self._node.destroy_guard_condition(self._finished)
 
     def _on_finished(self) -> None:
-        for query, future in self._worker.take_finished():
-            if query is not None:
-                query.adapting = False
-                self._take_over(query, future)
-            elif not future.cancelled() and future.exception() is not None:
-                self._node.get_logger().error(f'the critic cannot be used: {future.exception()}')
+        for handle, future in self._worker.take_finished():
+            handle(future)
         self._on_ended()
 
-    def _take_over(self, query: Query, future: 'Future[Outcome | None]') -> None:
-        reason = CANCELLED
-        if not future.cancelled():
-            try:
-                outcome = future.result()
-            except AdaptationCancelled:
-                pass
-            except (ValueError, RuntimeError) as error:
-                reason = self._monitor.remark = f'failed: {error}'
-                self._node.get_logger().error(f'goal {query.query_id}: {reason}')
-            else:
-                assert outcome is not None, 'the answer to a query'
-                self._conclude(query, outcome)
-                self._foresee(query)
-                return
-        self._announcer.report(query.query_id, query.episode_id, reason=reason)
+    def _on_adapted(self, pursuit: Pursuit, key: Hashable, future: 'Future[Adaptation]') -> None:
+        pursuit.adapting = False
+        base = self._deployment.agent
+        try:
+            adaptation = future.result()
+        except (AdaptationCancelled, CancelledError):
+            self._publishers.publish_report(pursuit.goal, Adaptation(base, reason=CANCELLED))
+        except (ValueError, RuntimeError) as error:
+            failed = Adaptation(base, reason=f'failed: {error}')
+            if not pursuit.adaptation.accepted:
+                pursuit.adaptation = failed
+            self._node.get_logger().error(f'goal {pursuit.goal.query_id}: {failed.reason}')
+            self._publishers.publish_report(pursuit.goal, failed)
+        else:
+            self._monitor.adapt_ms.add(1000 * adaptation.seconds)
+            self._cache.keep(key, adaptation)
+            self._conclude(pursuit, adaptation)
+            if pursuit.config.horizon and base.value_fn is not None:
+                job = partial(prefetch_values, self._deployment, pursuit.goal)
+                self._worker.start(self._on_prefetched, job)
 
-    def _conclude(self, query: Query, outcome: Outcome, *, cached: bool = False) -> None:
-        if not cached:
-            self._monitor.adapt_ms.add(1000 * outcome.adaptation.seconds)
-            self._cache.keep(query.cache_key, outcome)
-        self._monitor.remark = outcome.adaptation.reason
-        query.expert = outcome.adaptation.agent
-        query.adapted = outcome.adaptation.accepted
-        query.steps_done = len(outcome.adaptation.train_losses)
-        self._announcer.report(query.query_id, query.episode_id, outcome, cached=cached)
+    def _conclude(self, pursuit: Pursuit, adaptation: Adaptation, *, cached: bool = False) -> None:
+        pursuit.adaptation = adaptation
+        pursuit.progress = Progress(len(adaptation.train_losses))
+        self._publishers.publish_report(pursuit.goal, adaptation, cached=cached)
 
-    def _foresee(self, query: Query) -> None:
-        if query.config.horizon and self._deployment.agent.value_fn is not None:
-            self._worker.start(None, partial(foresee_values, self._deployment, query.goal))
+    def _on_prefetched(self, future: 'Future[None]') -> None:
+        if not future.cancelled() and future.exception() is not None:
+            self._node.get_logger().error(f'the critic cannot be used: {future.exception()}')

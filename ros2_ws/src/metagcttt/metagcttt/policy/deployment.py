@@ -1,8 +1,7 @@
-"""What a deployed policy consists of, and how it answers a query. No ROS in here."""
+"""A base policy with the dataset it adapts on, and its adaptation to a goal."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from itertools import count
 
 from metagcttt_core import (
     adapt,
@@ -10,17 +9,17 @@ from metagcttt_core import (
     Agent,
     FilterConfig,
     load_checkpoint,
-    SupportSet,
     TrajectoryDataset,
     TrajectoryFilter,
     TTTConfig,
 )
-from metagcttt_core.adaptation import AdaptationCancelled
+from metagcttt_core.adaptation import AdaptationCancelled, OnStep
+from metagcttt_core.config.assets import checkpoint_path, dataset_path
 from metagcttt_core.retrieval.value_cache import ValueFunction
 import numpy as np
 from numpy.typing import NDArray
 
-from metagcttt.assets import checkpoint_path, dataset_path
+from metagcttt.goal_in_force import Goal
 
 
 @dataclass(frozen=True)
@@ -37,18 +36,10 @@ class Deployment:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """The answer to one query; `support` is None when no adaptation was asked for."""
+class _CancellableValue:
+    """A critic whose evaluation, which takes seconds for a large dataset, can be cancelled.
 
-    support: SupportSet | None
-    adaptation: Adaptation
-
-
-@dataclass(frozen=True)
-class _StoppableValue:
-    """A critic whose evaluation, which takes seconds for a large dataset, can be given up.
-
-    Equal to that of another query when the critic is, so that values are remembered.
+    Two of the same critic are equal, so that values are cached across adaptations.
     """
 
     value_fn: ValueFunction
@@ -61,12 +52,12 @@ class _StoppableValue:
 
 
 def load_deployment(checkpoint: str, dataset: str, config: FilterConfig) -> Deployment:
-    """Load and index what a policy needs.
+    """Load a policy, and load and index its dataset.
 
     Args:
         checkpoint: Folder of the checkpoint; empty for the committed one.
         dataset: File of the dataset; empty for the committed one.
-        config: How sub-trajectories are chosen.
+        config: Selection of sub-trajectories.
 
     Raises:
         FileNotFoundError: If the committed assets are asked for and missing.
@@ -84,68 +75,66 @@ def load_deployment(checkpoint: str, dataset: str, config: FilterConfig) -> Depl
     return Deployment(agent, TrajectoryFilter(data, config))
 
 
-def answer_query(
+def warm_up(deployment: Deployment) -> None:
+    """Take one gradient step and discard it; policy and dataset are not changed.
+
+    At the first step PyTorch imports and initialises for a second or two, which would stall the
+    control loop.
+    """
+    observation = np.asarray(deployment.dataset.observations[0], dtype=np.float64)
+    agent, trajectory_filter = deployment.agent, deployment.trajectory_filter
+    support = trajectory_filter.query(observation, observation, agent.value_fn)
+    config = TTTConfig(steps=1, batch_size=2)
+    adapt(agent, deployment.dataset, support, observation, config)
+    agent.act(observation, observation)
+
+
+def adapt_to_goal(
     deployment: Deployment,
     observation: NDArray[np.float64],
-    goal: NDArray[np.float64],
+    goal: Goal,
     config: TTTConfig,
-    seed: int,
     should_stop: Callable[[], bool],
-    on_step: Callable[[int], None] = lambda steps_done: None,
-) -> Outcome:
-    """Filter and adapt for one query, as an evaluation episode does.
+    on_step: OnStep | None = None,
+) -> Adaptation:
+    """Filter the dataset for a goal and adapt, as an evaluation episode does.
 
     Args:
         deployment: Policy and dataset; not changed.
         observation: Current observation, shape (obs_dim,).
-        goal: Goal observation, shape (obs_dim,).
-        config: Inner loop; 0 steps ask for the base policy.
-        seed: Of everything random in the inner loop.
-        should_stop: Asked before every step, and between evaluations of the critic.
-        on_step: Called before every step with the number of steps done.
+        goal: The goal; its seed is that of the inner loop.
+        config: Inner loop; 0 steps return the base policy.
+        should_stop: Asked before every gradient step and every batch of the critic.
+        on_step: See `adapt`.
 
     Raises:
         AdaptationCancelled: If `should_stop` returned true.
     """
     agent, trajectory_filter = deployment.agent, deployment.trajectory_filter
     if config.steps == 0:
-        reason = 'adaptation is switched off (0 steps)'
-        return Outcome(None, Adaptation(agent, [], [], 0, False, reason, 0.0))
-    steps_done = count()
-
-    def stop_or_go_on() -> bool:
-        stop = should_stop()
-        if not stop:
-            on_step(next(steps_done))
-        return stop
-
-    value_fn = agent.value_fn and _StoppableValue(agent.value_fn, should_stop)
-    support = trajectory_filter.query(observation, goal, value_fn)
-    return Outcome(
-        support,
-        adapt(
-            agent,
-            deployment.dataset,
-            support,
-            goal,
-            config,
-            seed=seed,
-            should_stop=stop_or_go_on,
-        ),
+        return Adaptation(agent, reason='adaptation is switched off (0 steps)')
+    value_fn = agent.value_fn and _CancellableValue(agent.value_fn, should_stop)
+    return adapt(
+        agent,
+        deployment.dataset,
+        trajectory_filter.query(observation, goal.observation, value_fn),
+        goal.observation,
+        config,
+        seed=goal.seed,
+        should_stop=should_stop,
+        on_step=on_step,
     )
 
 
-def foresee_values(
-    deployment: Deployment, goal: NDArray[np.float64], should_stop: Callable[[], bool]
-) -> None:
-    """Evaluate the critic towards `goal` everywhere, so that the next query of it is quick.
+def prefetch_values(deployment: Deployment, goal: Goal, should_stop: Callable[[], bool]) -> None:
+    """Evaluate the critic towards `goal` on the whole dataset, which makes its next filter quick.
 
     Args:
         deployment: Policy and dataset; the policy has a critic.
-        goal: Goal observation, shape (obs_dim,).
-        should_stop: Asked now and then.
+        goal: The goal.
+        should_stop: Asked before every batch of the critic.
     """
     value_fn = deployment.agent.value_fn
-    assert value_fn is not None, 'policies without a critic have nothing to foresee'
-    remembered = _StoppableValue(value_fn, should_stop=lambda: False)
-    deployment.trajectory_filter.prefetch_values(remembered, goal, should_stop)
+    assert value_fn is not None, 'policies without a critic have nothing to prefetch'
+    cached = _CancellableValue(value_fn, should_stop=lambda: False)
+    deployment.trajectory_filter.prefetch_values(cached, goal.observation, should_stop)

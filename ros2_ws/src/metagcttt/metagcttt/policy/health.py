@@ -1,64 +1,51 @@
-"""How a policy is. No ROS in here."""
+"""Policy health."""
 
-from dataclasses import dataclass
 import time
 
 from metagcttt.health import Deadlines, Faults, Health, Level, Rate, Samples
-from metagcttt.policy.pilot import Query
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Thresholds above which a policy counts as degraded.
-
-    Attributes:
-        latency_ms: Of the 99th percentile of the time from a state's arrival to its action.
-        missed_deadlines: Control periods without an action in the last minute.
-        adapt_ms: Time that the last adaptation took.
-    """
-
-    latency_ms: float
-    missed_deadlines: int
-    adapt_ms: float
+from metagcttt.policy.decision import Pursuit
 
 
 class PolicyMonitor:
-    """Gathers figures while a policy runs and judges them."""
+    """Collects statistics while a policy runs and judges its health."""
 
     def __init__(self) -> None:
-        """Nothing has happened yet."""
+        """Start with empty statistics."""
         self.states = Rate()
         self.actions = Rate()
         self.latency_ms = Samples()
         self.adapt_ms = Samples(100)
         self.deadlines = Deadlines()
         self.faults = Faults()
-        self.remark = ''  # why the newest adaptation was not accepted
 
     def examine(
         self,
         *,
         acting: bool,
         zero_reason: str,
-        query: Query | None,
+        pursuit: Pursuit | None,
         num_publishers: int,
         num_pending: int,
-        limits: Limits,
+        warn_latency_ms: float,
+        warn_missed_deadlines: int,
+        warn_adapt_ms: float,
     ) -> Health:
-        """The health now.
+        """The current health.
 
         Args:
             acting: Whether the node is active.
-            zero_reason: Why the action is zero although the node acts; empty when it is not.
-            query: The goal in force.
-            num_publishers: Of actions in the graph, this one included.
-            num_pending: Adaptations that have not ended.
-            limits: What is still healthy.
+            zero_reason: Why the action is zero although the node is active; empty when it is not.
+            pursuit: The work on the goal in force, if there is one.
+            num_publishers: Publishers of actions in the graph, this one included.
+            num_pending: Jobs whose result was not handled yet.
+            warn_latency_ms: Threshold of the 99th percentile of the time from state to action.
+            warn_missed_deadlines: Threshold of control periods missed in the last minute.
+            warn_adapt_ms: Threshold of the duration of the last adaptation.
         """
         now_s = time.monotonic()
         missed = self.deadlines.in_last_minute(now_s)
         latency_ms = self.latency_ms.percentile(99)
-        base_reason = self.base_reason(query)
+        base_reason = _base_reason(pursuit)
         values = {
             'state_rate_hz': f'{self.states.per_second(now_s):.1f}',
             'action_rate_hz': f'{self.actions.per_second(now_s):.1f}',
@@ -81,22 +68,23 @@ class PolicyMonitor:
             level, message = Level.ERROR, f'just now: {recent}'
         elif num_publishers > 1:
             level, message = Level.WARN, f'{num_publishers} nodes publish actions'
-        elif latency_ms > limits.latency_ms:
+        elif latency_ms > warn_latency_ms:
             level, message = Level.WARN, f'99 % of actions within {latency_ms:.1f} ms only'
-        elif missed > limits.missed_deadlines:
+        elif missed > warn_missed_deadlines:
             level, message = Level.WARN, f'{missed} deadlines missed in the last minute'
-        elif self.adapt_ms.last() > limits.adapt_ms:
+        elif self.adapt_ms.last() > warn_adapt_ms:
             level, message = Level.WARN, f'the adaptation took {self.adapt_ms.last():.0f} ms'
-        elif query is None:
+        elif pursuit is None:
             message = 'no goal'
         elif base_reason:
             level, message = Level.WARN, f'acting with the base policy: {base_reason}'
         return Health(level, message, values)
 
-    def base_reason(self, query: Query | None) -> str:
-        """Why the base policy serves a goal; empty when the expert does."""
-        if query is None or query.adapted:
-            return ''
-        if query.adapting:
-            return f'{query.steps_done} of {query.config.steps} gradient steps done'
-        return self.remark or 'no state to adapt to yet'
+
+def _base_reason(pursuit: Pursuit | None) -> str:
+    """The reason why the base policy serves the goal; empty when the expert does."""
+    if pursuit is None or pursuit.adaptation.accepted:
+        return ''
+    if pursuit.adapting:
+        return f'{pursuit.progress.steps_done} of {pursuit.config.steps} gradient steps done'
+    return pursuit.adaptation.reason

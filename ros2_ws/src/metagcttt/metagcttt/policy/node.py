@@ -1,4 +1,4 @@
-"""The lifecycle of the policy; what it does while active is in `policy_session`."""
+"""The policy node and its lifecycle; `session` has its behaviour while configured."""
 
 import secrets
 from typing import Any
@@ -13,9 +13,8 @@ from metagcttt.diagnostics import Diagnostics
 from metagcttt.health import Health, Level
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import POLICY_NODE
-from metagcttt.policy.deployment import load_deployment
+from metagcttt.policy.deployment import load_deployment, warm_up
 from metagcttt.policy.session import PolicySession
-from metagcttt.policy.warm_up import warm_up
 
 
 class PolicyNode(LifecycleNode):
@@ -36,7 +35,7 @@ class PolicyNode(LifecycleNode):
         )
         self.add_post_set_parameters_callback(self._on_parameters_set)
         self.create_service(SetBool, 'enable', self._on_enable)
-        self._failure = ''  # of the newest configuration
+        self._failure = ''  # of the latest configuration
         self._diagnostics = Diagnostics(
             self, self._examine, self._settings['diagnostics_period_s']
         )
@@ -64,7 +63,7 @@ class PolicyNode(LifecycleNode):
             )
             warm_up(deployment)
         except (OSError, ValueError) as error:
-            # rclpy would swallow it without a word.
+            # rclpy would swallow it silently.
             self._failure = f'cannot configure: {error}'
             self.get_logger().error(self._failure)
             return TransitionCallbackReturn.FAILURE
@@ -96,14 +95,11 @@ class PolicyNode(LifecycleNode):
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Disconnect and free the policy and the dataset."""
+        """Close the session, which frees the policy and the dataset."""
         self._close_session()
         return TransitionCallbackReturn.SUCCESS
 
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop and free everything, for good."""
-        self._close_session()
-        return TransitionCallbackReturn.SUCCESS
+    on_shutdown = on_cleanup
 
     def _close_session(self) -> None:
         if self._session is not None:

@@ -1,56 +1,54 @@
-"""When a policy has to keep the robot still. No ROS in here."""
+"""The conditions under which a policy has to keep the robot still."""
 
-from metagcttt.policy.pilot import State
-from metagcttt.senders import Senders
+from metagcttt.input_checks import Senders
+from metagcttt.policy.decision import State
 
 
 class Safety:
-    """Knows the reasons for a zero action; each ends when its cause is gone.
+    """Tracks the reasons for a zero action; each ends with its cause.
 
     Attributes:
         enabled: Whether the robot may move at all.
         rivals: Other policies in the graph.
-        lost_goal: Why the goal in force was dropped; empty from the next goal on.
+        expired_goal: Why the goal in force was dropped; empty from the next goal on.
     """
 
     def __init__(self, *, enabled: bool) -> None:
-        """Nothing was heard yet."""
+        """Start without states, goals and other policies."""
         self.enabled = enabled
         self.rivals = Senders()
-        self.lost_goal = ''
+        self.expired_goal = ''
         self._state_s = self._state_clock_s = float('inf')
         self._lease_s = self._lease_end_s = float('inf')
 
     def saw_state(self, now_s: float, clock_s: float) -> None:
-        """A state arrived.
+        """Record the arrival of a state.
 
         Args:
-            now_s: The time now, seconds of a clock that only goes forward.
-            clock_s: The same by the node's clock, which may be simulated and stand still.
+            now_s: The time now, seconds of a monotonic clock.
+            clock_s: The same by the node's clock, which may be simulated and paused.
         """
         self._state_s, self._state_clock_s = now_s, clock_s
 
-    def state_age_s(self, now_s: float, clock_s: float) -> float:
-        """Seconds since the newest state, by the clock that went by faster."""
-        return max(now_s - self._state_s, clock_s - self._state_clock_s)
-
     def saw_goal(self, now_s: float, lease_s: float) -> None:
-        """A goal arrived, or was repeated; without another message it holds for `lease_s`."""
-        self.lost_goal = ''
+        """Record a goal or its repetition; it expires `lease_s` later, never with 0."""
+        self.expired_goal = ''
         self._lease_s = lease_s
         self._lease_end_s = now_s + lease_s if lease_s > 0 else float('inf')
 
-    def lose_goal(self, query_id: int, now_s: float) -> bool:
-        """Whether the goal in force is no longer repeated, as its node is gone."""
+    def expire_goal(self, query_id: int, now_s: float) -> bool:
+        """Drop the goal in force, for the reason kept, and return true if its lease ran out."""
         if now_s <= self._lease_end_s:
             return False
-        self.lost_goal = f'goal {query_id} was not repeated for {self._lease_s:g} s and is dropped'
+        self.expired_goal = (
+            f'goal {query_id} was not repeated for {self._lease_s:g} s and is dropped'
+        )
         return True
 
     def zero_reason(
         self, state: State | None, *, now_s: float, clock_s: float, timeout_s: float
     ) -> str:
-        """Why the robot may not move now; empty when it may.
+        """The reason why the robot may not move now; empty when it may.
 
         Args:
             state: The newest state.
@@ -58,13 +56,13 @@ class Safety:
             clock_s: See `saw_state`.
             timeout_s: Oldest age of a state to act on, seconds.
         """
-        age_s = self.state_age_s(now_s, clock_s)
+        age_s = max(now_s - self._state_s, clock_s - self._state_clock_s)
         if not self.enabled:
             return 'disabled by the service enable'
         if self.rivals.count(now_s):
             return 'another policy node acts in this graph'
-        if self.lost_goal:
-            return self.lost_goal
+        if self.expired_goal:
+            return self.expired_goal
         if age_s > timeout_s:
             return f'no state for {age_s:.1f} s'
         return state.fault if state is not None else ''

@@ -1,36 +1,35 @@
-"""A configured policy on the graph: takes states and goals, adapts and acts."""
+"""A configured policy: receives states and goals, adapts and acts."""
 
 from dataclasses import replace
 import time
 
-from metagcttt_core import TTTConfig
+from metagcttt_core import Adaptation, TTTConfig
 from metagcttt_interfaces.msg import GoalQuery, MazeState, PolicyStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode
 from rclpy.timer import Timer
 
-from metagcttt.converters import to_array
+from metagcttt.converters import to_array, to_goal
 from metagcttt.health import Health
+from metagcttt.input_checks import StateOrder, vector_fault
 from metagcttt.parameter_set import ParameterSet
-from metagcttt.policy.adapter import QueryAdapter
+from metagcttt.policy.adapter import GoalAdapter
+from metagcttt.policy.decision import decide, Pursuit, State
 from metagcttt.policy.deployment import Deployment
-from metagcttt.policy.health import Limits, PolicyMonitor
-from metagcttt.policy.pilot import choose, Query, State
-from metagcttt.policy.publishers import PolicyAnnouncer
+from metagcttt.policy.health import PolicyMonitor
+from metagcttt.policy.publishers import PolicyPublishers
 from metagcttt.policy.safety import Safety
 from metagcttt.qos import LATCHED, state_profile
-from metagcttt.state_order import StateOrder
-from metagcttt.vectors import vector_fault
 
 WARNING_PERIOD_S = 5.0
-WATCH_PERIOD_S = 0.1
+WATCHDOG_PERIOD_S = 0.1
 
 
 class PolicySession:
-    """What the policy node has between configuration and cleanup.
+    """The policy node's state and behaviour between configuration and cleanup.
 
-    Acts on the goal in force: with the base policy, then with the expert adapted to the goal.
-    Adaptations run in a thread of their own; everything else, and every change of this object,
+    Acts on the goal in force with the base policy, then with the expert adapted to the goal.
+    Adaptations run in a background thread; everything else, and every change of this object,
     happens in the thread that spins the node.
     """
 
@@ -43,13 +42,13 @@ class PolicySession:
         instance: int,
         enabled: bool = True,
     ) -> None:
-        """Connect; nothing is published before `start`.
+        """Create publishers, subscriptions and timers; `start` begins to publish.
 
         Args:
-            node: The node to connect through.
+            node: The node that owns them.
             settings: Its parameters.
             deployment: Policy and dataset.
-            instance: Number that tells this policy from others in the graph.
+            instance: Random number that identifies this policy in the graph.
             enabled: Whether actions may be other than zero.
         """
         self._node = node
@@ -59,20 +58,20 @@ class PolicySession:
         self._lockstep = settings['stepping'] == 'lockstep'
         self._acting = False
         self._timer: Timer | None = None
-        self._query: Query | None = None
+        self._pursuit: Pursuit | None = None
         self._goal_message: GoalQuery | None = None
         self._state: State | None = None
-        self._received_ns = 0  # when the newest state was; 0 once it is answered
-        self._answered = True  # whether the newest state got its action, in lockstep
+        self._received_ns = 0  # arrival of the newest state; 0 once answered
+        self._answered = True  # lockstep: whether the newest state got its action
         self._order = StateOrder()
         self._monitor = PolicyMonitor()
         self._safety = Safety(enabled=enabled)
-        self._say = PolicyAnnouncer(node, instance)
-        self._adapter = QueryAdapter(
-            node, settings, deployment, self._say, self._monitor, self._proceed
+        self._publishers = PolicyPublishers(node, instance)
+        self._adapter = GoalAdapter(
+            node, settings, deployment, self._publishers, self._monitor, self._proceed
         )
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._watch = node.create_timer(WATCH_PERIOD_S, self._on_watch, clock=steady)
+        self._watchdog = node.create_timer(WATCHDOG_PERIOD_S, self._on_watchdog, clock=steady)
         profile = state_profile(settings['stepping'])
         self._inputs = (
             node.create_subscription(
@@ -86,39 +85,39 @@ class PolicySession:
         )
 
     def start(self) -> None:
-        """Act from now on, beginning with the state and the goal that came before."""
+        """Start acting, on the state and the goal received so far."""
         self._acting = True
         self.pace()
         self._proceed()
 
     def stop(self) -> None:
-        """Stop, in realtime with a zero action; a goal in force is taken up again later."""
+        """Stop, in realtime with a zero action; `start` resumes the goal in force."""
         self._acting = False
         self._adapter.cancel()
-        if self._query is not None:
-            self._query.adapted_at = None
+        if self._pursuit is not None:
+            self._pursuit.adapted_at = None
         if self._timer is not None:
             self._stop_timer()
             self._publish_action(None)
 
     def enable(self, enabled: bool) -> None:
-        """Let actions be other than zero, or not; takes effect at once."""
+        """Allow actions other than zero, or not; takes effect immediately."""
         self._safety.enabled = enabled
         if self._timer is not None:
             self._on_tick()
 
     def close(self) -> None:
-        """Disconnect and end the adaptation thread."""
+        """Destroy publishers, subscriptions and timers, and join the background thread."""
         self._acting = False
         self._stop_timer()
         self._adapter.close()
         for subscription in self._inputs:
             self._node.destroy_subscription(subscription)
-        self._node.destroy_timer(self._watch)
-        self._say.destroy()
+        self._node.destroy_timer(self._watchdog)
+        self._publishers.destroy()
 
     def pace(self) -> None:
-        """(Re)start the timer that acts in realtime, at the rate set now."""
+        """(Re)start the realtime action timer at the current rate."""
         if self._acting and not self._lockstep:
             self._stop_timer()
             period_s = 1.0 / self._settings['rate_hz']
@@ -130,13 +129,13 @@ class PolicySession:
             self._timer = None
             self._monitor.deadlines.pause()
 
-    # --- what arrives ------------------------------------------------------------------------
+    # --- input -------------------------------------------------------------------------------
 
     def _on_state(self, message: MazeState, info: dict[str, int]) -> None:
         now_s = time.monotonic()
         self._monitor.states.add(now_s)
         out_of_order = ''
-        if not self._lockstep:  # there an answer names the one state that it is for
+        if not self._lockstep:  # where an action names the state it answers
             out_of_order = self._order.refusal(message.episode_id, message.step)
         observation = to_array(message.observation)
         fault = vector_fault('the state', observation, self._deployment.agent.obs_dim)
@@ -145,7 +144,7 @@ class PolicySession:
         elif fault:
             self._monitor.faults.note('malformed_states', fault, now_s)
         if out_of_order and self._state is not None:
-            # The simulator heeds actions for the episode it is in.
+            # The simulator takes actions for its current episode only.
             self._state = replace(self._state, fault=out_of_order)
         else:
             self._state = State(
@@ -158,41 +157,38 @@ class PolicySession:
         self._safety.saw_state(now_s, self._clock_s())
         self._received_ns = info['received_timestamp']
         self._answered = False
-        query = self._query
-        if query is not None and query.adapting and not query.serves(self._state):
+        pursuit = self._pursuit
+        if pursuit is not None and pursuit.adapting and not pursuit.serves(self._state):
             self._adapter.cancel()
         self._proceed()
 
     def _on_status(self, message: PolicyStatus) -> None:
         if message.instance != self._instance:
-            self._safety.rivals.hear(message.instance, time.monotonic())
+            self._safety.rivals.saw(message.instance, time.monotonic())
 
     def _on_goal(self, message: GoalQuery) -> None:
         self._safety.saw_goal(time.monotonic(), message.lease_s if message.active else 0.0)
         if message == self._goal_message:
-            return  # repeated, so that its silence means that the goal node is gone
+            return  # a repetition, which only renews the lease
         self._goal_message = message
         self._adapter.cancel()
-        self._query = None
-        goal = to_array(message.goal)
-        fault = vector_fault('the goal', goal, self._deployment.agent.obs_dim)
+        self._pursuit = None
+        goal, agent = to_goal(message), self._deployment.agent
+        fault = vector_fault('the goal', goal.observation, agent.obs_dim)
         if not message.active:
-            self._node.get_logger().info(f'goal {message.query_id} is over')
+            self._node.get_logger().info(f'goal {goal.query_id} is over')
         elif fault:
-            self._node.get_logger().error(f'goal {message.query_id} is refused: {fault}')
-            self._say.report(message.query_id, message.episode_id, reason=fault)
+            self._node.get_logger().error(f'goal {goal.query_id} is refused: {fault}')
+            self._publishers.publish_report(goal, Adaptation(agent, reason=fault))
         else:
-            self._query = Query(
-                query_id=message.query_id,
-                episode_id=message.episode_id,
-                goal=goal,
-                seed=message.seed,
+            self._pursuit = Pursuit(
+                goal,
                 config=self._ttt_config(),
                 hold=self._settings['adaptation'] == 'hold',
-                expert=self._deployment.agent,
+                adaptation=Adaptation(agent, reason='no state to adapt to yet'),
             )
         self._proceed()
-        if self._query is None and self._timer is not None:
+        if self._pursuit is None and self._timer is not None:
             self._on_tick()  # a stop does not wait for the next tick
 
     def _ttt_config(self) -> TTTConfig:
@@ -206,44 +202,43 @@ class PolicySession:
             horizon=self._settings['horizon'] or None,
         )
 
-    # --- what is done with it ----------------------------------------------------------------
+    # --- behaviour ---------------------------------------------------------------------------
 
     def _proceed(self) -> None:
-        """Do what the newest state and goal ask for: adapt and act."""
-        query, state = self._query, self._state
-        if not self._acting or query is None or state is None:
+        """Adapt and act as the newest state and goal require."""
+        pursuit, state = self._pursuit, self._state
+        if not self._acting or pursuit is None or state is None:
             return
-        if query.needs_adaptation(state):
-            self._adapter.adapt(query, state)
-        if not self._answered and query.has_action(state):
+        if pursuit.needs_adaptation(state):
+            self._adapter.adapt(pursuit, state)
+        if not self._answered and not pursuit.idle_reason(state):
             self._answered = True
-            self._publish_action(query)
+            self._publish_action(pursuit)
             if self._timer is not None:
                 self._timer.reset()
-        self._say.status(query, state)
+        self._publishers.publish_status(pursuit, state)
 
-    def _on_watch(self) -> None:
-        """Look after what may stop coming; not by the node's clock, which may stand still."""
-        now_s = time.monotonic()
-        query = self._query
-        if query is not None and self._safety.lose_goal(query.query_id, now_s):
-            self._node.get_logger().error(self._safety.lost_goal)
+    def _on_watchdog(self) -> None:
+        """Check the inputs for timeouts; on a steady clock, as the node's may stand still."""
+        pursuit = self._pursuit
+        if pursuit and self._safety.expire_goal(pursuit.goal.query_id, time.monotonic()):
+            self._node.get_logger().error(self._safety.expired_goal)
             self._adapter.cancel()
-            self._query = self._goal_message = None
+            self._pursuit = self._goal_message = None
         if self._timer is not None and self._zero_reason():
-            self._publish_action(self._query)
-        self._say.status(self._query, self._state)
+            self._publish_action(self._pursuit)
+        self._publishers.publish_status(self._pursuit, self._state)
 
-    # --- what is published -------------------------------------------------------------------
+    # --- output ------------------------------------------------------------------------------
 
     def _on_tick(self) -> None:
-        self._publish_action(self._query)
+        self._publish_action(self._pursuit)
 
     def _clock_s(self) -> float:
         return self._node.get_clock().now().nanoseconds / 1e9
 
     def _zero_reason(self) -> str:
-        """Why the robot may not move now; empty when it may."""
+        """The reason why the robot may not move now; empty when it may."""
         return self._safety.zero_reason(
             self._state,
             now_s=time.monotonic(),
@@ -251,23 +246,19 @@ class PolicySession:
             timeout_s=float('inf') if self._lockstep else self._settings['state_timeout_s'],
         )
 
-    def _publish_action(self, query: Query | None) -> None:
-        """Publish the action for the newest state; zero without a query."""
+    def _publish_action(self, pursuit: Pursuit | None) -> None:
+        """Publish the command for the newest state."""
         state = self._state
         if state is None:
             return
-        act_dim = self._deployment.agent.act_dim
-        zero_reason = self._zero_reason()
-        if zero_reason:
-            command = choose(replace(state, fault=zero_reason), query, act_dim)
-        else:
-            command = choose(state, query, act_dim)
-            if command.fault:
-                zero_reason = command.fault
-                self._monitor.faults.note('unusable_actions', zero_reason, time.monotonic())
-        if zero_reason:
-            self._warn(zero_reason)
-        self._say.action(state, command)
+        command = decide(state, pursuit, self._zero_reason(), self._deployment.agent.act_dim)
+        if command.cause == 'unusable':
+            self._monitor.faults.note('unusable_actions', command.reason, time.monotonic())
+        if command.cause in ('unsafe', 'unusable'):
+            self._node.get_logger().warning(
+                f'the action is zero: {command.reason}', throttle_duration_sec=WARNING_PERIOD_S
+            )
+        self._publishers.publish_action(state, command)
         self._measure()
 
     def _measure(self) -> None:
@@ -280,31 +271,22 @@ class PolicySession:
             return
         if not self._node.get_parameter('use_sim_time').value:
             self._monitor.deadlines.met(now_s, 1.0 / self._settings['rate_hz'])
-        elif self._query is not None and self._query.has_action(self._state):
+        elif self._pursuit is not None and not self._pursuit.idle_reason(self._state):
             self._monitor.deadlines.answered(now_s, self._state.episode_id, self._state.step)
         else:
             self._monitor.deadlines.pause()
 
-    def _no_source_reason(self) -> str:
-        # In lockstep no state gets too old.
-        return '' if self._node.count_publishers('state') else 'nobody publishes states'
-
     def examine(self) -> Health:
-        """How the policy is."""
+        """The current health of the policy."""
+        # In lockstep states have no timeout.
+        no_source = '' if self._node.count_publishers('state') else 'nobody publishes states'
         return self._monitor.examine(
             acting=self._acting,
-            zero_reason=self._zero_reason() or self._no_source_reason(),
-            query=self._query,
+            zero_reason=self._zero_reason() or no_source,
+            pursuit=self._pursuit,
             num_publishers=self._node.count_publishers('action'),
             num_pending=self._adapter.num_pending,
-            limits=Limits(
-                latency_ms=self._settings['warn_latency_ms'],
-                missed_deadlines=self._settings['warn_missed_deadlines'],
-                adapt_ms=self._settings['warn_adapt_ms'],
-            ),
-        )
-
-    def _warn(self, fault: str) -> None:
-        self._node.get_logger().warning(
-            f'the action is zero: {fault}', throttle_duration_sec=WARNING_PERIOD_S
+            warn_latency_ms=self._settings['warn_latency_ms'],
+            warn_missed_deadlines=self._settings['warn_missed_deadlines'],
+            warn_adapt_ms=self._settings['warn_adapt_ms'],
         )

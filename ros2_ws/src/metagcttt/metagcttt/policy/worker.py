@@ -1,4 +1,4 @@
-"""Adaptation beside the control loop: one thread, and the newest job wins."""
+"""The background thread of the policy node; the newest job wins."""
 
 from collections import deque
 from collections.abc import Callable
@@ -14,24 +14,24 @@ Result = TypeVar('Result')
 
 
 class AdaptationWorker(Generic[Key, Result]):
-    """Runs one job at a time in a thread of its own.
+    """Runs one job at a time in a background thread.
 
-    Results are collected with `take_finished` by the thread that started the jobs, so that its
-    state needs no locks.
+    The thread that starts the jobs collects their results with `take_finished`, so that its state
+    needs no locks.
     """
 
     def __init__(self, on_finished: Callable[[], None], num_threads: int) -> None:
-        """Start nothing yet.
+        """Create the thread pool.
 
         Args:
-            on_finished: Called from the worker's thread whenever a job has ended.
-            num_threads: Threads that PyTorch uses for a job; 0 leaves its own choice.
+            on_finished: Called from the background thread whenever a job has ended.
+            num_threads: PyTorch threads per job; 0: PyTorch's default.
         """
         self._on_finished = on_finished
         self._finished: deque[tuple[Key, Future[Result]]] = deque()
         self._cancel_current = threading.Event()
         self._current: Future[Result] | None = None
-        self.num_pending = 0  # jobs whose results were not collected yet
+        self.num_pending = 0  # jobs whose result was not collected yet
         # PyTorch keeps the number per thread.
         self._pool = ThreadPoolExecutor(
             max_workers=1,
@@ -40,11 +40,11 @@ class AdaptationWorker(Generic[Key, Result]):
         )
 
     def start(self, key: Key, job: Callable[[Callable[[], bool]], Result]) -> None:
-        """Run `job` after cancelling the job under way.
+        """Cancel the job under way and run `job`.
 
         Args:
-            key: Handed back with the result.
-            job: Called with a function that says whether to give up.
+            key: Returned with the result.
+            job: Called with a function that returns true when the job is cancelled.
         """
         self.cancel()
         self.num_pending += 1
@@ -58,13 +58,13 @@ class AdaptationWorker(Generic[Key, Result]):
         self._current.add_done_callback(collect)
 
     def cancel(self) -> None:
-        """Ask the job under way to give up; it ends within one gradient step."""
+        """Cancel the job under way; it ends within one gradient step."""
         self._cancel_current.set()
         if self._current is not None:
-            self._current.cancel()  # when it has not begun
+            self._current.cancel()  # if it has not started
 
     def take_finished(self) -> list[tuple[Key, 'Future[Result]']]:
-        """Jobs that ended since the last call, also cancelled ones."""
+        """The keys and futures of the jobs that ended since the last call, cancelled ones too."""
         taken = []
         while self._finished:
             taken.append(self._finished.popleft())
@@ -72,6 +72,6 @@ class AdaptationWorker(Generic[Key, Result]):
         return taken
 
     def close(self) -> None:
-        """Cancel and wait for the thread to end."""
+        """Cancel and join the thread."""
         self.cancel()
         self._pool.shutdown(wait=True, cancel_futures=True)

@@ -1,4 +1,4 @@
-"""The node that writes everything the graph says into a file."""
+"""The recorder node."""
 
 from datetime import datetime, UTC
 from functools import partial
@@ -25,14 +25,14 @@ OF_ROS = ('/rosout', '/parameter_events')
 
 
 class RecorderNode(Node):
-    """Records every topic of its namespace, and those that all robots share, as it appears.
+    """Records every topic of its namespace, and those that all robots share.
 
-    The bytes go from the middleware to the file as they are. A subscription takes on the quality
-    of the topic's publishers, and changes with it.
+    Serialized messages go to the file unchanged. A subscription follows the QoS of the topic's
+    publishers.
     """
 
     def __init__(self, **kwargs: Any) -> None:
-        """Create the file and begin to look for topics.
+        """Create the file and start to discover topics.
 
         Args:
             kwargs: For `rclpy.node.Node`.
@@ -48,7 +48,7 @@ class RecorderNode(Node):
         )
         self._subscriptions_by_topic: dict[str, Subscription] = {}
         self._refused: set[str] = set()
-        # Not the node's clock: that one stands still while the simulation does.
+        # Not the node's clock, which stops when the simulation is paused.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(SEARCH_PERIOD_S, self._search, clock=steady)
         self.create_timer(self._settings['flush_s'], self._recording.flush, clock=steady)
@@ -56,9 +56,9 @@ class RecorderNode(Node):
         self._search()
 
     def destroy_node(self) -> None:
-        """Record what is still on its way, finish the file and destroy the node.
+        """Record what is still in transit, finish the file and destroy the node.
 
-        That takes until nothing has come for `QUIET_S`, and `GRACE_S` on a graph that goes on.
+        Ends after `QUIET_S` without a message, and after `GRACE_S` on a busy graph.
         """
         executor = SingleThreadedExecutor(context=self.context)
         executor.add_node(self)
@@ -75,7 +75,7 @@ class RecorderNode(Node):
         self.get_logger().info(f'{self._recording.num_messages} messages in {names}')
 
     def _search(self) -> None:
-        """Subscribe to what is new on the graph, and anew where the quality has changed."""
+        """Subscribe to new topics, and again to those whose QoS has changed."""
         for topic, types in self.get_topic_names_and_types():
             if not self._is_wanted(topic):
                 continue

@@ -1,4 +1,4 @@
-"""MCAP files of ROS messages that standard tools open. Knows bytes and types, no node."""
+"""MCAP files of serialized ROS messages, for standard tools."""
 
 from collections.abc import Iterator
 from importlib import import_module
@@ -19,7 +19,7 @@ _BUILTIN = frozenset(
 
 
 class UnknownTypeError(LookupError):
-    """A message type that this machine does not have."""
+    """A message type that is not installed."""
 
 
 def message_class(type_name: str) -> Any:
@@ -38,7 +38,7 @@ def message_class(type_name: str) -> Any:
 
 
 def message_definition(type_name: str) -> str:
-    """The text of a message type and of all types in it, as the `ros2msg` schema wants it.
+    """The `ros2msg` schema of a message type: its definition and those of all types in it.
 
     Raises:
         UnknownTypeError: If a definition is not installed.
@@ -81,10 +81,10 @@ def _types_in(type_name: str, text: str) -> Iterator[str]:
 
 
 class Recording:
-    """Messages in one MCAP file or, with a size limit, in files one after the other.
+    """A recording in one MCAP file or, with a size limit, in consecutive files.
 
-    Whatever happens to the process, a file can be read up to the last `flush`. A file that exists
-    is never overwritten.
+    If the process is killed, a file is readable up to the last `flush`. An existing file is never
+    overwritten.
     """
 
     def __init__(self, path: Path, *, split_bytes: int = 0) -> None:
@@ -92,7 +92,7 @@ class Recording:
 
         Args:
             path: The file; later ones are NAME_1.mcap, NAME_2.mcap and so on beside it.
-            split_bytes: The next file begins when one is this large; 0: never.
+            split_bytes: Size at which the next file starts; 0: never.
 
         Raises:
             OSError: If the file exists or cannot be written.
@@ -106,7 +106,7 @@ class Recording:
         self._open(path)
 
     def add_topic(self, topic: str, type_name: str) -> None:
-        """Make a topic known before its first message.
+        """Register a topic before its first message.
 
         Raises:
             UnknownTypeError: If the definition of its type is not installed.
@@ -118,10 +118,10 @@ class Recording:
         """Append one message.
 
         Args:
-            topic: Its topic, known by `add_topic`.
-            data: The message as CDR.
-            log_time: When it was received, nanoseconds since 1970.
-            publish_time: When it was published, nanoseconds since 1970.
+            topic: Its topic, registered with `add_topic`.
+            data: The message, serialized as CDR.
+            log_time: Time of reception, nanoseconds since 1970.
+            publish_time: Time of publication, nanoseconds since 1970.
         """
         if self._split_bytes and self._file.tell() >= self._split_bytes:
             self.close()
@@ -136,7 +136,7 @@ class Recording:
         self.num_messages += 1
 
     def flush(self) -> None:
-        """Hand everything so far to the operating system, where a killed process leaves it."""
+        """Pass everything so far to the operating system, where it survives a kill."""
         self._writer.flush()
 
     def close(self) -> None:

@@ -1,1 +1,1 @@
-"""The simulator on the graph: publishes maze states and steps with the actions it is sent."""
+"""The simulator bridge: publishes states and steps the simulator with the actions received."""

@@ -1,45 +1,44 @@
-"""How a simulator's bridge is. No ROS in here."""
+"""Health of the simulator bridge."""
 
 import time
 
 from metagcttt.health import Faults, Health, Level, Rate
-from metagcttt.senders import Senders
+from metagcttt.input_checks import Senders
 
 
 class SimMonitor:
-    """Gathers figures while a world is stepped, and judges them."""
+    """Collects statistics while a simulator is stepped, and judges its health."""
 
     def __init__(self) -> None:
-        """Nothing has happened yet."""
+        """Start with empty statistics."""
         self.states = Rate()
         self.actions = Rate()
         self.faults = Faults()
         self._senders = Senders()
 
     def saw_action(self, fault: str, instance: int) -> None:
-        """An action for this episode arrived.
+        """Record an action for this episode.
 
         Args:
-            fault: Why it is not used; empty when it is.
+            fault: Why it is ignored; empty when it is used.
             instance: Number of its sender.
         """
         now_s = time.monotonic()
-        self._senders.hear(instance, now_s)
+        self._senders.saw(instance, now_s)
         self.actions.add(now_s)
         if fault:
             self.faults.note('malformed_actions', fault, now_s)
 
     def num_senders(self) -> int:
-        """How many nodes have sent actions for this episode within the last second."""
+        """The number of nodes that sent actions for this episode within the last second."""
         return self._senders.count(time.monotonic())
 
     def examine(self, *, num_publishers: int, action_is_old: bool) -> Health:
-        """The health now.
+        """The current health.
 
         Args:
-            num_publishers: Of actions.
-            action_is_old: In realtime: the newest action is too old, so the world goes on with
-                zero.
+            num_publishers: Publishers of actions.
+            action_is_old: In realtime: the newest action has timed out and is replaced by zero.
         """
         now_s = time.monotonic()
         values = {
@@ -58,5 +57,5 @@ class SimMonitor:
         elif num_publishers == 0:
             level, message = Level.WARN, 'nobody publishes actions'
         elif action_is_old:
-            level, message = Level.WARN, 'the action is zero: none has come lately'
+            level, message = Level.WARN, 'the action is zero: none was received recently'
         return Health(level, message, values)

@@ -1,4 +1,4 @@
-"""The node that owns a simulator."""
+"""The simulator bridge node."""
 
 import math
 import time
@@ -28,6 +28,7 @@ from metagcttt.converters import (
 )
 from metagcttt.diagnostics import Diagnostics
 from metagcttt.health import Health
+from metagcttt.input_checks import vector_fault
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import SIM_BRIDGE_NODE
 from metagcttt.qos import (
@@ -41,27 +42,26 @@ from metagcttt.qos import (
 )
 from metagcttt.sim.health import SimMonitor
 from metagcttt.sim.pacing import Pacer
-from metagcttt.vectors import vector_fault
 
 HEARTBEAT_S = 0.1
 
 
 class SimBridgeNode(Node):
-    """Steps one simulator with the actions it is sent and publishes what comes of it.
+    """Steps one simulator with the actions received and publishes its states.
 
-    In `realtime` it steps by itself, with the newest action or, when that is too old, with zero.
-    In `lockstep` it publishes a state and stands still until the action for that very state
-    arrives. While more than one node sends actions, it takes zero instead. After a task episode
-    has ended nothing moves until the next reset. While it is paused nothing moves but by the
-    service `step`. In realtime the last state is published on while it is paused or steps rarely,
-    so that nobody takes the simulator for dead.
+    In `realtime` it steps on its own, with the newest action or, when that has timed out, with
+    zero. In `lockstep` it publishes a state and waits for the action for that state. While more
+    than one node sends actions, it applies zero instead. After the end of a task episode, or while
+    paused, nothing moves until the next reset or except by the service `step`. In realtime the
+    last state is repeated while paused or stepping slowly, so that the simulator is not taken for
+    dead.
 
     The header of a state carries simulated time, which starts at 0 with the node and never goes
     back; `/clock` carries the same.
     """
 
     def __init__(self, **kwargs: Any) -> None:
-        """Load the simulator and begin a free episode.
+        """Load the simulator and start an episode without a task.
 
         Args:
             kwargs: For `rclpy.node.Node`.
@@ -83,7 +83,7 @@ class SimBridgeNode(Node):
         self._action = np.zeros(spec.act_dim)
         self._action_time_ns = 0
         self._paused = bool(self._settings['start_paused'])
-        self._awaiting: NDArray[np.float64] | None = None  # lockstep: arrived while paused
+        self._awaiting: NDArray[np.float64] | None = None  # lockstep: received while paused
 
         profile = keep_several(state_profile(self._settings['stepping']), RECORDED_DEPTH)
         self._states = self.create_publisher(MazeState, 'state', profile)
@@ -92,7 +92,7 @@ class SimBridgeNode(Node):
         self._clock_messages = None
         if self._settings['publish_clock']:
             self._clock_messages = self.create_publisher(ClockMessage, '/clock', SENSOR)
-        # Of two senders none is overheard; the newest action still wins.
+        # Deep enough to notice every sender; the newest action still wins.
         self.create_subscription(ActionCommand, 'action', self._on_action, keep_several(COMMAND))
         self.create_service(Trigger, 'reset', self._on_reset)
         self.create_service(SetTask, 'set_task', self._on_set_task)
@@ -120,7 +120,7 @@ class SimBridgeNode(Node):
         super().destroy_node()
 
     def _pace(self) -> None:
-        """(Re)start the timer that steps the world in realtime, and the count of its steps."""
+        """(Re)start the realtime timer and the count of its steps."""
         if self._lockstep:
             return
         if self._timer is not None:
@@ -128,7 +128,7 @@ class SimBridgeNode(Node):
         period_s = self._simulator.spec.control_period_s / self._settings['speed_factor']
         self._pacer = Pacer(period_s, time.monotonic())
         self._beats_per_step = math.ceil(period_s / HEARTBEAT_S)
-        # Not the node's clock: that one may be the simulated time made here.
+        # Not the node's clock, which may be the simulated time published here.
         self._timer = self.create_timer(
             period_s / self._beats_per_step,
             self._on_tick,
@@ -139,7 +139,7 @@ class SimBridgeNode(Node):
         if any(parameter.name == 'speed_factor' for parameter in parameters):
             self._pace()
 
-    # --- time passes -------------------------------------------------------------------------
+    # --- stepping ----------------------------------------------------------------------------
 
     def _on_tick(self) -> None:
         if self._paused:
@@ -154,7 +154,7 @@ class SimBridgeNode(Node):
         if self._pacer.num_lost > lost:
             self.get_logger().warning(
                 f'too slow for speed_factor {self._settings["speed_factor"]:g}: '
-                f'{self._pacer.num_lost - lost} steps were left out',
+                f'{self._pacer.num_lost - lost} steps were dropped',
                 throttle_duration_sec=5.0,
             )
 
@@ -174,7 +174,7 @@ class SimBridgeNode(Node):
 
     def _on_action(self, message: ActionCommand) -> None:
         if message.episode_id != self._episode_id:
-            return  # meant for an episode that is over
+            return  # for an episode that is over
         if self._lockstep and message.step != self._step:
             return
         if self._lockstep and (self._last.terminated or self._last.truncated):
@@ -191,7 +191,7 @@ class SimBridgeNode(Node):
         else:
             self._action, self._action_time_ns = values, self._time_ns
 
-    # --- time stands still -------------------------------------------------------------------
+    # --- pause -------------------------------------------------------------------------------
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         was, self._paused = self._paused, request.data
@@ -199,24 +199,24 @@ class SimBridgeNode(Node):
             self._pace()
             self._advance_awaiting()
         response.success = True
-        response.message = f'{"paused" if self._paused else "runs"}, {self._where()}'
+        response.message = f'{"paused" if self._paused else "running"}, {self._where()}'
         return response
 
     def _on_step(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if not self._paused:
-            response.message = 'the simulation runs: pause it first'
+            response.message = 'the simulation is running: pause it first'
         elif not self._lockstep:
             self._advance_realtime()
             response.success = True
         elif self._advance_awaiting():
             response.success = True
         else:
-            response.message = f'no action has arrived for {self._where()}'
+            response.message = f'no action was received for {self._where()}'
         response.message = response.message or self._where()
         return response
 
     def _advance_awaiting(self) -> bool:
-        """Take the lockstep action that arrived while paused; false when there is none."""
+        """Step with the lockstep action received while paused; false when there is none."""
         values, self._awaiting = self._awaiting, None
         if values is not None:
             self._advance(values)
@@ -225,7 +225,7 @@ class SimBridgeNode(Node):
     def _where(self) -> str:
         return f'step {self._step} of episode {self._episode_id}'
 
-    # --- episodes begin ----------------------------------------------------------------------
+    # --- episodes ----------------------------------------------------------------------------
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._begin(self._simulator.reset_free(), seed=0)
@@ -241,7 +241,6 @@ class SimBridgeNode(Node):
                 task_id=int(request.task_id), seed=int(request.seed)
             )
         except ValueError as error:
-            response.success = False
             response.message = str(error)
             return response
         self._begin(observation, int(request.seed), goal if request.send_goal else None)
@@ -276,7 +275,7 @@ class SimBridgeNode(Node):
         )
         self._publish_state()
 
-    # --- what is published -------------------------------------------------------------------
+    # --- output ------------------------------------------------------------------------------
 
     def _header(self) -> Header:
         return Header(stamp=to_time(self._time_ns), frame_id=self._settings['frame_id'])

@@ -1,25 +1,25 @@
-"""How many steps of a simulation are due. No ROS in here."""
+"""Pacing of a simulation against real time."""
 
 import math
 
 BURST = 2
-"""Steps made at once to make up for a delay; few, so that new actions come in between."""
+"""Most steps at once to catch up; few, so that new actions arrive in between."""
 
 
 class Pacer:
-    """Counts steps against deadlines that are fixed from the start, so that delays do not add up.
+    """Counts steps against deadlines fixed from the start, so that delays do not accumulate.
 
-    A delay is made up for little by little. What is beyond `max_lag_s` is lost and counted: the
-    machine is too slow for the pace that was asked for.
+    A delay is caught up gradually. Steps beyond `max_lag_s` are dropped and counted: the machine
+    is too slow for the requested pace.
     """
 
     def __init__(self, period_s: float, now_s: float, max_lag_s: float = 0.5) -> None:
-        """Begin to count.
+        """Start counting.
 
         Args:
-            period_s: Time between two steps, seconds of the clock that `now_s` is read from.
+            period_s: Time between two steps, seconds of the clock of `now_s`.
             now_s: The time now; the first step is due one period later.
-            max_lag_s: Longest delay that is made up for, seconds.
+            max_lag_s: Longest delay to catch up, seconds.
         """
         self._period_s = period_s
         self._start_s = now_s
@@ -28,10 +28,10 @@ class Pacer:
         self.num_lost = 0
 
     def due(self, now_s: float) -> int:
-        """Steps to make now, 0 to `BURST`.
+        """The number of steps to make now, 0 to `BURST`.
 
-        Deadlines are rounded to the nearest, so a timer of the same period gets one step each
-        time, whether it is a little early or late.
+        Deadlines are rounded to the nearest, so that a timer of the same period gets one step each
+        time, whether it fires a little early or late.
 
         Args:
             now_s: The time now.

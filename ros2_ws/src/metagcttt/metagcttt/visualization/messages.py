@@ -1,4 +1,4 @@
-"""What RViz shows, made from positions. Pure functions; no node is needed to use them."""
+"""Messages for RViz, made from positions by pure functions."""
 
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
@@ -23,14 +23,14 @@ TEXT_HEIGHT_M = 0.8
 def odometry(
     header: Header, base_frame: str, xy: tuple[float, float], yaw: float, speed: float
 ) -> Odometry:
-    """Where the agent is and how fast it moves ahead.
+    """The odometry of the agent.
 
     Args:
         header: Time and frame of the position.
         base_frame: Frame of the velocity, the agent's own.
         xy: Position in metres.
         yaw: Direction of travel, radians, counted from x towards y.
-        speed: Along that direction, metres per second.
+        speed: Speed in that direction, metres per second.
     """
     message = Odometry(header=header, child_frame_id=base_frame)
     message.pose.pose.position = to_point(xy)
@@ -40,7 +40,7 @@ def odometry(
 
 
 def path(header: Header, positions: Iterable[tuple[float, float]]) -> Path:
-    """Positions in metres as a path; the poses look along x."""
+    """The path through positions in metres; its poses face along x."""
     message = Path(header=header)
     for xy in positions:
         pose = PoseStamped(header=header)
@@ -59,16 +59,16 @@ def markers(
     value: float | None,
     xy: tuple[float, float],
 ) -> MarkerArray:
-    """The goal, what was retrieved for it and the value of the current state.
+    """Markers of the goal, the sub-trajectories retrieved for it and the value of the state.
 
-    What is absent is deleted from the picture.
+    Markers of what is absent are deleted.
 
     Args:
         header: Time and frame.
-        goal: Its position in metres, if there is one.
+        goal: Position of the goal in metres, if there is one.
         radius_m: Distance within which it is reached, metres.
         segments: Sub-trajectories, each (n, 2) in metres.
-        value: Of the current state for the goal, if the policy has a critic.
+        value: Value of the current state for the goal, if the policy has a critic.
         xy: The agent's position in metres.
     """
     disc = _marker(header, 'goal', Marker.CYLINDER, GOLD, shown=goal is not None)
@@ -108,9 +108,9 @@ def _marker(
 def thinned(
     segments: Sequence[NDArray[np.floating]], max_points: int
 ) -> list[NDArray[np.floating]]:
-    """Sub-trajectories with every n-th point only, so that all have about `max_points` at most.
+    """Sub-trajectories thinned to about `max_points` in total.
 
-    The last point of each is kept. Those of a single point have no line and are left out.
+    The last point of each is kept. Those of a single point, which have no line, are dropped.
     """
     stride = max(1, math.ceil(sum(len(segment) for segment in segments) / max_points))
     return [

@@ -1,10 +1,11 @@
-"""The node that makes what RViz shows. It watches the graph; nothing depends on it."""
+"""The visualization node, on which no other node depends."""
 
 from collections import deque
 import math
 from typing import Any
 
 from metagcttt_core import load_checkpoint, TrajectoryDataset
+from metagcttt_core.config.assets import checkpoint_path, dataset_path
 from metagcttt_interfaces.msg import AdaptationReport, GoalQuery, MazeState
 from nav_msgs.msg import Odometry, Path
 import numpy as np
@@ -15,7 +16,6 @@ from sim_bridge import describe_environment
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
-from metagcttt.assets import checkpoint_path, dataset_path
 from metagcttt.converters import to_array
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import VISUALIZATION_NODE
@@ -26,10 +26,10 @@ SPACING_M = 0.1
 
 
 class VisualizationNode(Node):
-    """Publishes odometry with every state; path and markers rarely, because they are large."""
+    """Publishes odometry with every state; path and markers, which are large, at a low rate."""
 
     def __init__(self, **kwargs: Any) -> None:
-        """Load the plan of the maze, the dataset and the policy, whose critic is shown.
+        """Load the layout of the maze, the dataset and the policy, whose critic is shown.
 
         Args:
             kwargs: For `rclpy.node.Node`.
@@ -54,11 +54,11 @@ class VisualizationNode(Node):
         self._odometry = self.create_publisher(Odometry, 'odom', COMMAND)
         self._path = self.create_publisher(Path, 'path', LATCHED)
         self._markers = self.create_publisher(MarkerArray, 'markers', LATCHED)
-        # A viewer takes what it gets: best effort fits either stepping.
+        # Best effort matches the publisher in either stepping.
         self.create_subscription(MazeState, 'state', self._on_state, SENSOR)
         self.create_subscription(GoalQuery, 'goal', self._on_goal, LATCHED)
         self.create_subscription(AdaptationReport, 'adaptation', self._on_report, EVENTS)
-        # Not the node's clock: a paused simulation can be looked at too.
+        # Not the node's clock, which stops while the simulation is paused.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(1.0 / self._settings['rate_hz'], self._publish, clock=steady)
 

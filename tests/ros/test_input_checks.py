@@ -1,8 +1,25 @@
 from hypothesis import given
 from hypothesis import strategies as st
-from metagcttt.state_order import StateOrder
+from metagcttt.input_checks import Senders, StateOrder, vector_fault
+import numpy as np
+import pytest
 
 numbers = st.tuples(st.integers(0, 5), st.integers(0, 5))
+
+
+@pytest.mark.parametrize(
+    ('values', 'fault'),
+    [
+        ([1.0, 2.0], ''),
+        ([1e39, 0.0], 'the state is not finite: [1e+39, 0.0]'),
+        ([1.0], 'the state has 1 values, 2 are needed'),
+        ([], 'the state has 0 values, 2 are needed'),
+        ([1.0, np.nan], 'the state is not finite: [1.0, nan]'),
+        ([-np.inf, 0.0], 'the state is not finite: [-inf, 0.0]'),
+    ],
+)
+def test_vector_fault(values: list[float], fault: str) -> None:
+    assert vector_fault('the state', np.array(values, dtype=np.float64), 2) == fault
 
 
 def taken(*states: tuple[int, int]) -> list[bool]:
@@ -38,3 +55,11 @@ def test_backward_states_do_not_count_as_a_restart() -> None:
 @given(st.lists(numbers, max_size=30))
 def test_newest_state_is_taken_whatever_came_before(states: list[tuple[int, int]]) -> None:
     assert taken(*states, (6, 0))[-1]
+
+
+def test_senders_are_forgotten_after_a_second_of_silence() -> None:
+    senders = Senders()
+    assert senders.count(0.0) == 0
+    for instance, now_s in [(1, 0.0), (2, 0.3), (1, 0.6)]:
+        senders.saw(instance, now_s)
+    assert [senders.count(now_s) for now_s in (0.6, 1.3, 1.31, 1.6, 1.7)] == [2, 2, 1, 1, 0]
