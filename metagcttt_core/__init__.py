@@ -1,19 +1,45 @@
 """Meta-GC-TTT: offline goal-conditioned policies that adapt at test time."""
 
-from importlib import import_module
 from typing import TYPE_CHECKING
 
+from metagcttt_core.lazy import exports
+
 if TYPE_CHECKING:
-    from metagcttt_core.adaptation import adapt, Adaptation, TTTConfig
-    from metagcttt_core.agents import Agent, make_agent
-    from metagcttt_core.data import DatasetError, TrajectoryDataset
-    from metagcttt_core.evaluation import evaluate_success, normalized_auc, success_statistics
-    from metagcttt_core.meta import MetaConfig, post_train
+    from metagcttt_core.adaptation.adapt import adapt
+    from metagcttt_core.adaptation.config import TTTConfig
+    from metagcttt_core.adaptation.result import Adaptation
+    from metagcttt_core.agents.agent import Agent
+    from metagcttt_core.agents.registry import make_agent
+    from metagcttt_core.data.dataset import TrajectoryDataset
+    from metagcttt_core.data.errors import DatasetError
+    from metagcttt_core.evaluation.rollout import evaluate_success
+    from metagcttt_core.evaluation.statistics import normalized_auc, success_statistics
+    from metagcttt_core.meta.config import MetaConfig
+    from metagcttt_core.meta.post_train import post_train
     from metagcttt_core.retrieval import FilterConfig, SupportSet, TrajectoryFilter
     from metagcttt_core.training.checkpoint import (
         CheckpointError,
         load_checkpoint,
         save_checkpoint,
+    )
+else:
+    __getattr__ = exports(
+        __name__,
+        {
+            'adaptation.adapt': ('adapt',),
+            'adaptation.config': ('TTTConfig',),
+            'adaptation.result': ('Adaptation',),
+            'agents.agent': ('Agent',),
+            'agents.registry': ('make_agent',),
+            'data.dataset': ('TrajectoryDataset',),
+            'data.errors': ('DatasetError',),
+            'evaluation.rollout': ('evaluate_success',),
+            'evaluation.statistics': ('normalized_auc', 'success_statistics'),
+            'meta.config': ('MetaConfig',),
+            'meta.post_train': ('post_train',),
+            'retrieval': ('FilterConfig', 'SupportSet', 'TrajectoryFilter'),
+            'training.checkpoint': ('CheckpointError', 'load_checkpoint', 'save_checkpoint'),
+        },
     )
 
 __all__ = [
@@ -36,26 +62,3 @@ __all__ = [
     'save_checkpoint',
     'success_statistics',
 ]
-
-# A name is imported when it is first asked for: PyTorch takes a second or more, and the dataset
-# and the filter do without it.
-_NAMES = {
-    'adaptation': ('Adaptation', 'TTTConfig', 'adapt'),
-    'agents': ('Agent', 'make_agent'),
-    'data': ('DatasetError', 'TrajectoryDataset'),
-    'evaluation': ('evaluate_success', 'normalized_auc', 'success_statistics'),
-    'meta': ('MetaConfig', 'post_train'),
-    'retrieval': ('FilterConfig', 'SupportSet', 'TrajectoryFilter'),
-    'training.checkpoint': ('CheckpointError', 'load_checkpoint', 'save_checkpoint'),
-}
-_MODULES = {name: module for module, names in _NAMES.items() for name in names}
-
-if not TYPE_CHECKING:  # which knows the names from above
-
-    def __getattr__(name: str) -> object:
-        """The public object of that name."""
-        if name not in _MODULES:
-            raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
-        value = getattr(import_module(f'{__name__}.{_MODULES[name]}'), name)
-        globals()[name] = value
-        return value

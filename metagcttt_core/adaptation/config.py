@@ -5,7 +5,7 @@ from typing import Literal
 from pydantic import Field
 
 from metagcttt_core.config.settings import Settings
-from metagcttt_core.training.optimizers import OptimizerName
+from metagcttt_core.training.config import OptimizerName
 
 
 class InnerLoopConfig(Settings):

@@ -9,7 +9,8 @@ from torch import Tensor
 from metagcttt_core.adaptation.inner_loop import BestStep, copy_weights
 from metagcttt_core.adaptation.result import Adaptation
 from metagcttt_core.agents.agent import Agent, TensorBatch
-from metagcttt_core.training.optimizers import make_optimizer, OptimizerName
+from metagcttt_core.training.config import OptimizerName
+from metagcttt_core.training.optimizers import make_optimizer
 from metagcttt_core.training.step import gradient_step
 
 _WARM_UP_STEPS = 3

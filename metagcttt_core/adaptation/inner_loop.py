@@ -8,7 +8,8 @@ import torch
 
 from metagcttt_core.adaptation.result import Adaptation, AdaptationCancelled, OnStep
 from metagcttt_core.agents.agent import Agent, TensorBatch
-from metagcttt_core.training.optimizers import make_optimizer, OptimizerName
+from metagcttt_core.training.config import OptimizerName
+from metagcttt_core.training.optimizers import make_optimizer
 from metagcttt_core.training.step import gradient_step
 
 

@@ -9,7 +9,8 @@ from torch.func import functional_call, vmap
 from metagcttt_core.adaptation.functional import AgentLoss
 from metagcttt_core.adaptation.result import Adaptation
 from metagcttt_core.agents.agent import Agent, TensorBatch
-from metagcttt_core.training.optimizers import make_optimizer, OptimizerName
+from metagcttt_core.training.config import OptimizerName
+from metagcttt_core.training.optimizers import make_optimizer
 
 
 def run_inner_loops(

@@ -7,29 +7,14 @@ import math
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from pydantic import Field, PositiveInt
 import torch
 from torch import nn, Tensor
 
+from metagcttt_core.agents.config import AgentSettings
 from metagcttt_core.agents.networks import MLP
-from metagcttt_core.config.settings import Settings
-from metagcttt_core.data.relabel import GoalConfig
 
 TensorBatch = dict[str, Tensor]
 _HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
-
-
-class AgentSettings(Settings):
-    """Settings that all agents share."""
-
-    hidden: tuple[PositiveInt, ...] = Field(
-        (512, 512, 512), min_length=1, description='units of each hidden layer'
-    )
-    const_std: bool = Field(
-        True, description='unit standard deviation of the actor (else learned)'
-    )
-    discount: float = Field(0.99, gt=0, lt=1, description='of values and of geometric goals')
-    goals: GoalConfig = GoalConfig()
 
 
 class Agent(nn.Module, ABC):

@@ -4,14 +4,8 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from metagcttt_core.agents.agent import Agent, AgentSettings, TensorBatch
-from metagcttt_core.data.relabel import GoalConfig
-
-
-class GCBCSettings(AgentSettings):
-    """Settings of GCBC: actor goals are later states of the trajectory; no value goals."""
-
-    goals: GoalConfig = GoalConfig(value=None)
+from metagcttt_core.agents.agent import Agent, TensorBatch
+from metagcttt_core.agents.config import AgentSettings, GCBCSettings
 
 
 class GCBC(Agent):

@@ -2,29 +2,16 @@
 
 from dataclasses import dataclass
 import hashlib
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
-from pydantic import Field
 import torch
 from torch import nn, Tensor
 from torch.func import functional_call
 
-from metagcttt_core.agents.agent import Agent, AgentSettings, TensorBatch
+from metagcttt_core.agents.agent import Agent, TensorBatch
+from metagcttt_core.agents.config import AgentSettings, GCIQLSettings
 from metagcttt_core.agents.networks import MLP
-
-ActorLoss = Literal['ddpgbc', 'awr', 'bc']
-
-
-class GCIQLSettings(AgentSettings):
-    """Settings of GCIQL."""
-
-    actor_loss: ActorLoss = Field('ddpgbc', description='policy extraction')
-    alpha: float = Field(
-        0.3, ge=0, description='ddpgbc: weight of cloning; awr: inverse temperature of advantages'
-    )
-    expectile: float = Field(0.9, gt=0, lt=1, description='of the value regression')
-    tau: float = Field(0.005, gt=0, le=1, description='rate of the target critics')
 
 
 class GCIQL(Agent):

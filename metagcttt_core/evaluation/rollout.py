@@ -6,7 +6,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from metagcttt_core.adaptation import adapt, Adaptation, TTTConfig
+from metagcttt_core.adaptation.adapt import adapt
+from metagcttt_core.adaptation.config import TTTConfig
+from metagcttt_core.adaptation.result import Adaptation
 from metagcttt_core.agents.agent import Agent
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.retrieval.support import SupportSet

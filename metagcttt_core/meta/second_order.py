@@ -8,7 +8,7 @@ from torch.func import functional_call
 
 from metagcttt_core.adaptation.functional import AgentLoss
 from metagcttt_core.agents.agent import Agent, TensorBatch
-from metagcttt_core.training.optimizers import OptimizerName
+from metagcttt_core.training.config import OptimizerName
 
 _BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-8  # of torch's Adam
 

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from metagcttt_core.agents.agent import Agent, TensorBatch
+from metagcttt_core.training.config import Precision
 
-Precision = Literal['float32', 'bfloat16', 'auto']
 LossFunction = Callable[[TensorBatch], tuple[Tensor, dict[str, Tensor]]]
 
 _BFLOAT16_MIN_UNITS = 256  # `metagcttt benchmark training`: at 128 units it costs

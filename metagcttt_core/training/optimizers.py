@@ -3,12 +3,12 @@
 from collections.abc import Callable, Iterable
 import copy
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import nn
 
-OptimizerName = Literal['adam', 'sgd']
+from metagcttt_core.training.config import OptimizerName
 
 # Fused: one kernel over all parameters. Torch's Adam adds eps after bias correction, as optax
 # does.

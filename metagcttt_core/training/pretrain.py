@@ -4,25 +4,16 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from pydantic import Field
 import torch
 
 from metagcttt_core.agents.agent import Agent
-from metagcttt_core.config.settings import Settings
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.data.relabel import GoalRelabeller
-from metagcttt_core.training.numerics import loss_function, Precision
+from metagcttt_core.training.config import Precision, PretrainConfig
+from metagcttt_core.training.numerics import loss_function
 from metagcttt_core.training.optimizers import make_optimizer
 from metagcttt_core.training.run import TrainingRun
 from metagcttt_core.training.step import gradient_step
-
-
-class PretrainConfig(Settings):
-    """Settings of pre-training (OGBench's defaults)."""
-
-    steps: int = Field(400_000, ge=1, description='gradient steps')
-    lr: float = Field(3e-4, gt=0, description='learning rate of Adam')
-    batch_size: int = Field(1024, ge=1, description='transitions per step')
 
 
 def pretrain(

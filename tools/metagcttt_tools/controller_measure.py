@@ -22,7 +22,6 @@ from sim_bridge.mazes.ogbench_layouts import UNIT_M
 from tqdm import tqdm
 
 from metagcttt_tools.common.cli import fail, parse
-from metagcttt_tools.common.plots import controller_picture, save
 from metagcttt_tools.common.results import markdown_table
 from metagcttt_tools.common.session import provenance
 from metagcttt_tools.controller.film import film
@@ -55,6 +54,8 @@ class MeasureSettings(Settings):
 def main(argv: list[str] | None = None) -> None:
     """Run the tool."""
     settings = parse(MeasureSettings, _DESCRIPTION, 'controller measure', argv)
+    from metagcttt_tools.common.plots import controller_picture, save
+
     try:
         follower = load_follower(settings.controller)
     except ValueError as error:

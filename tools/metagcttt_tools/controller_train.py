@@ -1,26 +1,28 @@
 """Train the controller that walks the ant along a direction, which offline data needs."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from metagcttt_core.config import Settings
 from metagcttt_core.files import atomic_write
 import numpy as np
 from pydantic import Field
 from safetensors import safe_open
-import safetensors.torch
 from sim_bridge.controllers import LearnedFollower
 from sim_bridge.controllers.training_ground import TrainingGround
-from torch import Tensor
 from tqdm import tqdm
 
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.run_log import RunLog
 from metagcttt_tools.common.session import provenance, stop_on_signal, use_threads, write_settings
-from metagcttt_tools.controller.replay import ReplayBuffer
-from metagcttt_tools.controller.sac import SAC, SACConfig
+from metagcttt_tools.controller.config import SACConfig
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 _DESCRIPTION = """Train the controller that walks the ant along a direction (SAC).
 
@@ -58,6 +60,9 @@ class ControllerTraining:
 
     def __init__(self, settings: TrainControllerSettings) -> None:
         """Build everything, fresh."""
+        from metagcttt_tools.controller.replay import ReplayBuffer
+        from metagcttt_tools.controller.sac import SAC
+
         self.settings = settings
         self.ground = TrainingGround()
         dims = self.ground.obs_dim, self.ground.act_dim
@@ -125,6 +130,8 @@ class ControllerTraining:
 
     def save(self) -> None:
         """Write the controller, then the checkpoint, each whole or not at all."""
+        import safetensors.torch
+
         self.follower().save(self.settings.out / 'controller')
         tensors = {**self.learner.tensors(), **self.replay.tensors()}
         metadata = {'settings': json.dumps(_decisive(self.settings))}

@@ -10,8 +10,6 @@ from tqdm import tqdm
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.run_log import RunLog
 from metagcttt_tools.common.session import stop_on_signal, use_threads, write_settings
-from metagcttt_tools.controller.humanoid import HumanoidTraining
-from metagcttt_tools.controller.recipe import STAGES
 
 _DESCRIPTION = """Train the controller that walks the humanoid along a direction (SAC).
 
@@ -44,6 +42,9 @@ def main(argv: list[str] | None = None) -> None:
 
 
 def _run(settings: TrainHumanoidSettings) -> None:
+    from metagcttt_tools.controller.humanoid import HumanoidTraining
+    from metagcttt_tools.controller.recipe import STAGES
+
     stages = tuple(
         replace(stage, sweeps=max(1, round(settings.length * stage.sweeps))) for stage in STAGES
     )

@@ -1,21 +1,25 @@
 """Turn parameters of OGBench's own JAX agents into a checkpoint to deploy and train on here."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from pathlib import Path
 import re
-from typing import Annotated, Any
+from typing import Annotated, Any, TYPE_CHECKING
 
-from metagcttt_core import Agent, DatasetError, make_agent, save_checkpoint
+from metagcttt_core import DatasetError
 from metagcttt_core.agents import AgentName
-from metagcttt_core.agents.gciql import ActorLoss
+from metagcttt_core.agents.config import ActorLoss
 from metagcttt_core.config import Settings
 from metagcttt_core.data.npz import read_arrays
-from metagcttt_core.training.checkpoint import has_checkpoint
 import numpy as np
 from pydantic import Field
 import tyro
 
 from metagcttt_tools.common.cli import fail, parse
+
+if TYPE_CHECKING:
+    from metagcttt_core import Agent
 
 _DESCRIPTION = """Turn parameters of OGBench's JAX agents (.npz) into a checkpoint.
 
@@ -50,6 +54,9 @@ class ConvertSettings(Settings):
 def main(argv: list[str] | None = None) -> None:
     """Run the tool."""
     settings = parse(ConvertSettings, _DESCRIPTION, 'convert', argv)
+    from metagcttt_core import save_checkpoint
+    from metagcttt_core.training.checkpoint import has_checkpoint
+
     if has_checkpoint(settings.out):
         fail(f'{settings.out} holds a checkpoint: choose another --out')
     try:
@@ -90,6 +97,8 @@ def agent_from(arrays: Mapping[str, np.ndarray], name: AgentName, **settings: An
     Raises:
         ValueError: If arrays are missing, unknown or of a wrong shape; names them.
     """
+    from metagcttt_core import make_agent
+
     own = from_ogbench_names(arrays)
     kernels = [own.get(f'actor.{layer}.kernel') for layer in (*_hidden_layers(own), 'mean')]
     if len(kernels) < 2 or any(kernel is None or kernel.ndim != 2 for kernel in kernels):

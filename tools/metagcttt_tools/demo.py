@@ -1,10 +1,11 @@
 """The main job: goals published on a topic make a robot filter, adapt and drive there."""
 
+from __future__ import annotations
+
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
-from metagcttt.commander import NoAnswerError
 from metagcttt_core import TrajectoryDataset
 from metagcttt_core.config import assets_dir, Settings
 from metagcttt_core.files import write_json
@@ -13,11 +14,10 @@ from pydantic import Field
 from sim_bridge import make_simulator
 
 from metagcttt_tools.common.cli import fail, parse
-from metagcttt_tools.common.plots import demo_picture, save
 from metagcttt_tools.common.session import provenance
-from metagcttt_tools.graph.client import GoalOutcome, MazeClient
-from metagcttt_tools.graph.drive import drive_arms
-from metagcttt_tools.graph.process import NodeFailedError
+
+if TYPE_CHECKING:
+    from metagcttt_tools.graph.client import GoalOutcome
 
 _DESCRIPTION = """Drive the point maze over ROS 2: three policies, five goals.
 
@@ -42,6 +42,10 @@ class DemoSettings(Settings):
 def main(argv: list[str] | None = None) -> None:
     """Run the tool."""
     settings = parse(DemoSettings, _DESCRIPTION, 'demo', argv)
+    from metagcttt.commander import NoAnswerError
+
+    from metagcttt_tools.graph.process import NodeFailedError
+
     try:
         outcomes = run_arms(settings)
     except (NodeFailedError, NoAnswerError, FileNotFoundError) as error:
@@ -53,6 +57,9 @@ def main(argv: list[str] | None = None) -> None:
 
 def run_arms(settings: DemoSettings) -> dict[str, list[GoalOutcome]]:
     """Outcome of each task's goal by arm, from three processes that talk over DDS."""
+    from metagcttt_tools.graph.client import MazeClient
+    from metagcttt_tools.graph.drive import drive_arms
+
     arms = {
         'base policy': ('base', 0),
         f'base + TTT (K = {settings.steps})': ('base', settings.steps),
@@ -78,6 +85,8 @@ def run_arms(settings: DemoSettings) -> dict[str, list[GoalOutcome]]:
 
 def report(settings: DemoSettings, outcomes: dict[str, list[GoalOutcome]]) -> None:
     """Print the table; write the summary and the picture."""
+    from metagcttt_tools.common.plots import demo_picture, save
+
     summary = {
         'environment': _ENVIRONMENT,
         'settings': settings.model_dump(mode='json'),

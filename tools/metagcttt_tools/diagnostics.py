@@ -1,23 +1,22 @@
 """Pictures of a meta-post-training run: k*, losses, drift, support sizes, redraws."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
-import matplotlib
-
-matplotlib.use('Agg')
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from metagcttt_core.config import Settings
 import numpy as np
 from pydantic import Field
-from torch.utils.tensorboard import SummaryWriter
 
 from metagcttt_tools.common.cli import fail, parse
-from metagcttt_tools.common.plots import COLORS, save
 from metagcttt_tools.common.run_log import METRICS, read_metrics
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _DESCRIPTION = """Draw what happened in a meta-post-training run, finished or not.
 
@@ -41,6 +40,10 @@ class DiagnosticsSettings(Settings):
 def main(argv: list[str] | None = None) -> None:
     """Run the tool."""
     settings = parse(DiagnosticsSettings, _DESCRIPTION, 'diagnostics', argv)
+    from torch.utils.tensorboard import SummaryWriter
+
+    from metagcttt_tools.common.plots import save
+
     path = settings.run / METRICS
     if not path.is_file():
         fail(f'{settings.run}: no run of metagcttt meta-train there ({METRICS} is missing)')
@@ -66,6 +69,10 @@ def main(argv: list[str] | None = None) -> None:
 
 def best_steps_picture(records: Records) -> Figure:
     """How many steps the inner loops keep: shares over the run, and the histogram of k*."""
+    from matplotlib.figure import Figure
+
+    from metagcttt_tools.common.plots import COLORS
+
     figure = Figure(figsize=(9, 3.4), layout='constrained')
     over_run, whole = figure.subplots(1, 2)
     groups = grouped(records)
@@ -96,6 +103,10 @@ def best_steps_picture(records: Records) -> Figure:
 
 def inner_losses_picture(records: Records) -> Figure:
     """Train and test loss over the inner steps at three times of the run (paper, figure 8)."""
+    from matplotlib.figure import Figure
+
+    from metagcttt_tools.common.plots import COLORS
+
     figure = Figure(figsize=(10, 3.4), layout='constrained')
     panels = figure.subplots(1, 3, sharey=True)
     share = max(1, len(records) // 10)
@@ -124,6 +135,10 @@ def inner_losses_picture(records: Records) -> Figure:
 
 def run_picture(records: Records) -> Figure:
     """Losses, drift, support sizes and redraws over the outer steps."""
+    from matplotlib.figure import Figure
+
+    from metagcttt_tools.common.plots import COLORS
+
     figure = Figure(figsize=(9, 6), layout='constrained')
     (losses, drift), (support, redraws) = figure.subplots(2, 2, sharex=True)
     groups = grouped(records)

@@ -5,7 +5,6 @@ from pathlib import Path
 
 from metagcttt_core import DatasetError, TrajectoryDataset
 from metagcttt_core.config import Settings
-import ogbench
 from pydantic import Field
 from sim_bridge import describe_environment, SimulatorSpec
 import tyro
@@ -56,6 +55,8 @@ def download(name: str, folder: Path) -> None:
     Raises:
         DatasetError: If they cannot be fetched; says what to do.
     """
+    import ogbench
+
     missing = [path for path in files_of(name, folder) if not path.exists()]
     if not missing:
         return

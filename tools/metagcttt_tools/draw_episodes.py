@@ -1,26 +1,23 @@
 """Draw one episode per task: what was retrieved for it and where a policy went."""
 
-from pathlib import Path
-from typing import Any
+from __future__ import annotations
 
-from metagcttt_core import (
-    FilterConfig,
-    load_checkpoint,
-    TrajectoryDataset,
-    TrajectoryFilter,
-    TTTConfig,
-)
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+from metagcttt_core import FilterConfig, TrajectoryDataset, TrajectoryFilter, TTTConfig
 from metagcttt_core.config import Settings
-from metagcttt_core.evaluation import Episode, run_episode
 import numpy as np
 from pydantic import Field
 from sim_bridge import make_simulator
 from tqdm import tqdm
 
 from metagcttt_tools.common.cli import fail, parse
-from metagcttt_tools.common.plots import demo_picture, save
 from metagcttt_tools.common.results import markdown_table, write_report
 from metagcttt_tools.common.session import use_threads
+
+if TYPE_CHECKING:
+    from metagcttt_core.evaluation import Episode
 
 _DESCRIPTION = """Draw one episode per task: what was retrieved and where a policy went.
 
@@ -55,6 +52,11 @@ def main(argv: list[str] | None = None) -> None:
 
 
 def _run(settings: DrawSettings) -> None:
+    from metagcttt_core import load_checkpoint
+    from metagcttt_core.evaluation import run_episode
+
+    from metagcttt_tools.common.plots import demo_picture, save
+
     agent = load_checkpoint(settings.checkpoint)
     dataset = TrajectoryDataset.load(settings.dataset)
     trajectory_filter = TrajectoryFilter(dataset, settings.filter)

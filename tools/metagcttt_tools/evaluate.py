@@ -8,17 +8,14 @@ import sys
 from typing import Any
 
 from metagcttt_core import (
-    CheckpointError,
-    evaluate_success,
     FilterConfig,
-    load_checkpoint,
     normalized_auc,
     success_statistics,
     TrajectoryDataset,
     TrajectoryFilter,
     TTTConfig,
 )
-from metagcttt_core.agents.gciql import ActorLoss
+from metagcttt_core.agents.config import ActorLoss
 from metagcttt_core.config import Settings
 from metagcttt_core.files import write_json
 import numpy as np
@@ -182,6 +179,8 @@ def environment_of(checkpoint: Path) -> str:
     Raises:
         CheckpointError: If it is damaged or does not say so.
     """
+    from metagcttt_core import CheckpointError, load_checkpoint
+
     environment = load_checkpoint(checkpoint).metadata.get('environment')
     if environment is None:
         raise CheckpointError(f'{checkpoint}: does not say which environment it is for')
@@ -204,6 +203,8 @@ def _start_worker(settings: EvaluateSettings) -> None:
 
 
 def _success_rate(job: Job) -> float:
+    from metagcttt_core import evaluate_success, load_checkpoint
+
     path, environment, budget, seed, task = job
     simulator = make_simulator(environment)
     result = evaluate_success(

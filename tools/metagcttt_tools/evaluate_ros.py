@@ -1,12 +1,12 @@
 """Success of policies in the ROS graph, in the episodes of `metagcttt evaluate`."""
 
+from __future__ import annotations
+
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
-from metagcttt.commander import NoAnswerError
 from metagcttt_core import FilterConfig, TTTConfig
-from metagcttt_core.evaluation.rollout import episode_seed
 from metagcttt_core.files import write_json
 import numpy as np
 from pydantic import Field, model_validator
@@ -21,9 +21,9 @@ from metagcttt_tools.evaluate import (
     success_curve,
     success_point,
 )
-from metagcttt_tools.graph.client import GoalOutcome, MazeClient
-from metagcttt_tools.graph.drive import drive_arms
-from metagcttt_tools.graph.process import NodeFailedError
+
+if TYPE_CHECKING:
+    from metagcttt_tools.graph.client import GoalOutcome
 
 _DESCRIPTION = """Success of policies by test-time training budget, driven through the ROS graph.
 
@@ -61,7 +61,7 @@ class EvaluateRosSettings(EpisodeSettings):
     )
 
     @model_validator(mode='after')
-    def _must_be_parameters(self) -> 'EvaluateRosSettings':
+    def _must_be_parameters(self) -> EvaluateRosSettings:
         """What policy_node has no parameter for stays at its default."""
         ttt = self.ttt.model_dump(include=set(_TTT_PARAMETERS) | {'steps'})
         filtering = self.filter.model_dump(include=set(_FILTER_PARAMETERS))
@@ -82,6 +82,10 @@ class EvaluateRosSettings(EpisodeSettings):
 def main(argv: list[str] | None = None) -> None:
     """Run the tool."""
     settings = parse(EvaluateRosSettings, _DESCRIPTION, 'evaluate-ros', argv, section='evaluate')
+    from metagcttt.commander import NoAnswerError
+
+    from metagcttt_tools.graph.process import NodeFailedError
+
     try:
         results = evaluate_ros(settings)
     except (NodeFailedError, NoAnswerError, ValueError) as error:
@@ -109,6 +113,11 @@ def evaluate_ros(settings: EvaluateRosSettings) -> list[dict[str, Any]]:
         NodeFailedError: If a node ends; with its log.
         NoAnswerError: If a node does not answer in time.
     """
+    from metagcttt_core.evaluation.rollout import episode_seed
+
+    from metagcttt_tools.graph.client import MazeClient
+    from metagcttt_tools.graph.drive import drive_arms
+
     environments = {environment_of(path) for path in settings.checkpoints}
     if len(environments) > 1:
         raise ValueError(f'checkpoints for one environment at a time, got {sorted(environments)}')

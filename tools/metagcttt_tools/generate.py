@@ -15,7 +15,6 @@ from sim_bridge.generation.plan import plan_dataset
 from tqdm import tqdm
 
 from metagcttt_tools.common.cli import fail, parse
-from metagcttt_tools.common.plots import coverage_picture, save
 
 DESCRIPTION = """Generate an offline dataset of a maze in OGBench's npz format.
 
@@ -125,6 +124,8 @@ def _run(settings: GenerateSettings) -> None:
 
 
 def _draw(environment: str, dataset: Path, picture: Path) -> None:
+    from metagcttt_tools.common.plots import coverage_picture, save
+
     description = describe_environment(environment)
     positions = TrajectoryDataset.load(dataset).observations[:, description.spec.position_dims]
     save(coverage_picture(description.maze, positions), picture)

@@ -1,6 +1,9 @@
 """Turn recordings of deployed robots into a dataset, so that deployments grow the data."""
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from metagcttt_core import TrajectoryDataset
 from metagcttt_core.config import Settings
@@ -8,11 +11,9 @@ from metagcttt_core.data import DatasetError
 from pydantic import Field
 
 from metagcttt_tools.common.cli import fail, parse
-from metagcttt_tools.recordings.trajectories import (
-    join_datasets,
-    read_recordings,
-    RecordingSummary,
-)
+
+if TYPE_CHECKING:
+    from metagcttt_tools.recordings.trajectories import RecordingSummary
 
 _DESCRIPTION = """Turn MCAP recordings of recorder_node into a dataset (.npz).
 
@@ -39,6 +40,8 @@ class RecordingSettings(Settings):
 def main(argv: list[str] | None = None) -> None:
     """Run the tool."""
     settings = parse(RecordingSettings, _DESCRIPTION, 'import-recordings', argv)
+    from metagcttt_tools.recordings.trajectories import join_datasets, read_recordings
+
     if settings.out.exists() and not settings.overwrite:
         fail(f'{settings.out} exists: give --overwrite or another --out')
     try:

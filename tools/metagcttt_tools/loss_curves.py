@@ -1,33 +1,27 @@
 """Losses by part, over the steps of test-time training (appendix B) or of pre-training."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
-from matplotlib.figure import Figure
-from metagcttt_core import (
-    Agent,
-    FilterConfig,
-    load_checkpoint,
-    TrajectoryDataset,
-    TrajectoryFilter,
-    TTTConfig,
-)
-from metagcttt_core.adaptation.batches import QueryBatches
-from metagcttt_core.agents.gciql import ActorLoss
+from metagcttt_core import FilterConfig, TrajectoryDataset, TrajectoryFilter, TTTConfig
+from metagcttt_core.agents.config import ActorLoss
 from metagcttt_core.config import Settings
 from metagcttt_core.retrieval.support import SupportSet
-from metagcttt_core.training.optimizers import make_optimizer
-from metagcttt_core.training.step import gradient_step
 import numpy as np
 from pydantic import Field
 from sim_bridge import make_simulator
 
 from metagcttt_tools.common.cli import fail, parse
-from metagcttt_tools.common.plots import COLORS, save
 from metagcttt_tools.common.results import markdown_table, write_report
 from metagcttt_tools.common.run_log import METRICS, read_metrics
 from metagcttt_tools.common.session import use_threads
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from metagcttt_core import Agent
 
 _DESCRIPTION = """Draw the losses of test-time training by part: total, actor, critic, value.
 
@@ -67,6 +61,8 @@ class LossCurvesSettings(Settings):
 def main(argv: list[str] | None = None) -> None:
     """Run the tool."""
     settings = parse(LossCurvesSettings, _DESCRIPTION, 'loss-curves', argv)
+    from metagcttt_tools.common.plots import save
+
     use_threads(1)
     try:
         if settings.run is not None:
@@ -88,6 +84,8 @@ def main(argv: list[str] | None = None) -> None:
 
 def test_time_curves(settings: LossCurvesSettings) -> Curves:
     """Losses of adapting to the start and goal of a task, by learning rate and part."""
+    from metagcttt_core import load_checkpoint
+
     changes = settings.model_dump(include={'actor_loss'}, exclude_none=True)
     agent = load_checkpoint(settings.checkpoint, changes=changes)
     trajectory_filter = TrajectoryFilter(TrajectoryDataset.load(settings.dataset), settings.filter)
@@ -118,6 +116,10 @@ def adaptation_losses(
     seed: int = 0,
 ) -> dict[str, list[float]]:
     """The losses before each step that `adapt` would take, `total` and by part."""
+    from metagcttt_core.adaptation.batches import QueryBatches
+    from metagcttt_core.training.optimizers import make_optimizer
+    from metagcttt_core.training.step import gradient_step
+
     rng = np.random.default_rng(np.random.SeedSequence(seed).spawn(2)[1])
     batches = QueryBatches(
         agent,
@@ -178,6 +180,10 @@ def roughness_rows(curves: Curves) -> list[dict[str, Any]]:
 
 def loss_picture(steps: Sequence[int], curves: Mapping[str, Any], axis: str) -> Figure:
     """One panel a part of the loss, one line a learning rate."""
+    from matplotlib.figure import Figure
+
+    from metagcttt_tools.common.plots import COLORS
+
     parts = [part for part in _PANELS if part in next(iter(curves.values()))]
     figure = Figure(figsize=(3.2 * len(parts), 3), layout='constrained')
     panels = np.atleast_1d(figure.subplots(1, len(parts)))

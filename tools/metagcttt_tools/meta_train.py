@@ -1,21 +1,12 @@
 """Meta-post-train a policy so that a few steps of test-time training make it an expert."""
 
-from pathlib import Path
+from __future__ import annotations
 
-from metagcttt_core import (
-    Agent,
-    CheckpointError,
-    DatasetError,
-    load_checkpoint,
-    MetaConfig,
-    post_train,
-    save_checkpoint,
-    TrajectoryDataset,
-)
-from metagcttt_core.agents.gciql import ActorLoss
-from metagcttt_core.meta import DivergedError, OuterStep, TaskError
-from metagcttt_core.meta.diagnostics import Diagnostics
-from metagcttt_core.meta.health import HealthWatch
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from metagcttt_core import DatasetError, MetaConfig, TrajectoryDataset
+from metagcttt_core.agents.config import ActorLoss
 from pydantic import Field
 
 from metagcttt_tools.common.cli import fail, parse
@@ -27,6 +18,10 @@ from metagcttt_tools.common.session import (
     training_session,
     use_threads,
 )
+
+if TYPE_CHECKING:
+    from metagcttt_core import Agent
+    from metagcttt_core.meta import OuterStep
 
 _DESCRIPTION = """Meta-post-train a pre-trained policy (Algorithm 1).
 
@@ -55,6 +50,9 @@ class MetaTrainSettings(RunSettings):
 def main(argv: list[str] | None = None) -> None:
     """Run the tool."""
     settings = parse(MetaTrainSettings, _DESCRIPTION, 'meta-train', argv)
+    from metagcttt_core import CheckpointError
+    from metagcttt_core.meta import DivergedError, TaskError
+
     use_threads(settings.threads)
     try:
         with process_group(settings.device):
@@ -66,6 +64,11 @@ def main(argv: list[str] | None = None) -> None:
 
 
 def _run(settings: MetaTrainSettings) -> None:
+    from metagcttt_core import load_checkpoint, post_train, save_checkpoint
+    from metagcttt_core.meta import DivergedError
+    from metagcttt_core.meta.diagnostics import Diagnostics
+    from metagcttt_core.meta.health import HealthWatch
+
     changes = settings.model_dump(include={'actor_loss'}, exclude_none=True)
     base = load_checkpoint(settings.checkpoint, changes=changes).to(settings.device)
     dataset = TrajectoryDataset.load(settings.dataset)

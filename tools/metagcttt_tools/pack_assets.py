@@ -2,13 +2,7 @@
 
 from pathlib import Path
 
-from metagcttt_core import (
-    CheckpointError,
-    DatasetError,
-    load_checkpoint,
-    save_checkpoint,
-    TrajectoryDataset,
-)
+from metagcttt_core import DatasetError, TrajectoryDataset
 from metagcttt_core.config import Settings
 from metagcttt_core.files import atomic_write
 import numpy as np
@@ -38,6 +32,8 @@ class PackSettings(Settings):
 def main(argv: list[str] | None = None) -> None:
     """Run the tool."""
     settings = parse(PackSettings, _DESCRIPTION, 'pack-assets', argv)
+    from metagcttt_core import CheckpointError, load_checkpoint, save_checkpoint
+
     try:
         for name in ('base', 'meta'):
             save_checkpoint(load_checkpoint(getattr(settings, name)), settings.out / name)

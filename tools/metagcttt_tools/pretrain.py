@@ -1,29 +1,24 @@
 """Pre-train a goal-conditioned policy on an offline dataset."""
 
+from __future__ import annotations
+
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Self, TYPE_CHECKING
 
-from metagcttt_core import Agent, CheckpointError, DatasetError, make_agent, TrajectoryDataset
+from metagcttt_core import DatasetError, TrajectoryDataset
 from metagcttt_core.agents import AgentName
-from metagcttt_core.agents.gcbc import GCBCSettings
-from metagcttt_core.agents.gciql import GCIQLSettings
-from metagcttt_core.training.numerics import Precision, resolve_precision
-from metagcttt_core.training.pretrain import pretrain, PretrainConfig
+from metagcttt_core.agents.config import GCBCSettings, GCIQLSettings
+from metagcttt_core.training.config import Precision, PretrainConfig
 from pydantic import Field, model_validator
-from torch import Tensor
 import tyro
 
 from metagcttt_tools.common.cli import fail, parse
-from metagcttt_tools.common.pretraining_metrics import (
-    as_scalars,
-    keep_snapshot,
-    success_rates,
-    Throughput,
-    Validation,
-    validation_data,
-)
 from metagcttt_tools.common.session import provenance, RunSettings, training_session, use_threads
+
+if TYPE_CHECKING:
+    from metagcttt_core import Agent
+    from torch import Tensor
 
 _DESCRIPTION = """Pre-train a goal-conditioned policy on an offline dataset.
 
@@ -73,6 +68,8 @@ class PretrainSettings(RunSettings):
 def main(argv: list[str] | None = None) -> None:
     """Run the tool."""
     settings = parse(PretrainSettings, _DESCRIPTION, 'pretrain', argv)
+    from metagcttt_core import CheckpointError
+
     use_threads(settings.threads)
     try:
         _run(settings)
@@ -81,6 +78,19 @@ def main(argv: list[str] | None = None) -> None:
 
 
 def _run(settings: PretrainSettings) -> None:
+    from metagcttt_core import make_agent
+    from metagcttt_core.training.numerics import resolve_precision
+    from metagcttt_core.training.pretrain import pretrain
+
+    from metagcttt_tools.common.pretraining_metrics import (
+        as_scalars,
+        keep_snapshot,
+        success_rates,
+        Throughput,
+        Validation,
+        validation_data,
+    )
+
     dataset = TrajectoryDataset.load(settings.dataset)
     agent = make_agent(
         settings.agent,

@@ -14,7 +14,6 @@ from pydantic import Field
 import tyro
 
 from metagcttt_tools.common.cli import fail, parse
-from metagcttt_tools.common.plots import post_training_curves, save, success_curves
 
 _DESCRIPTION = """Tables and figures of a study that metagcttt sweep ran.
 
@@ -37,6 +36,8 @@ class ReportSettings(Settings):
 def main(argv: list[str] | None = None) -> None:
     """Run the tool."""
     settings = parse(ReportSettings, _DESCRIPTION, 'report', argv)
+    from metagcttt_tools.common.plots import post_training_curves, save, success_curves
+
     try:
         report = read_study(settings.study, settings.threshold)
     except ValueError as error:

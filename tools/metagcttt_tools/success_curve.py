@@ -1,21 +1,22 @@
 """Success over pre-training steps (the paper's figure 9), from a run's snapshots."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
 import sys
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
-from matplotlib.figure import Figure
 from metagcttt_core import success_statistics
-from metagcttt_core.training.checkpoint import has_checkpoint
 import numpy as np
 from pydantic import Field
 
 from metagcttt_tools.common.cli import fail, parse
-from metagcttt_tools.common.plots import COLORS, save
-from metagcttt_tools.common.pretraining_metrics import SNAPSHOTS
 from metagcttt_tools.common.results import markdown_table, write_report
 from metagcttt_tools.evaluate import evaluate, EvaluateSettings, ProtocolSettings
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _DESCRIPTION = """Success over the steps of pre-training, by test-time training budget.
 
@@ -39,6 +40,8 @@ class SuccessCurveSettings(ProtocolSettings):
 def main(argv: list[str] | None = None) -> None:
     """Run the tool."""
     settings = parse(SuccessCurveSettings, _DESCRIPTION, 'success-curve', argv)
+    from metagcttt_tools.common.plots import save
+
     try:
         steps = common_steps(settings.runs)
         evaluation = EvaluateSettings(
@@ -61,6 +64,8 @@ def main(argv: list[str] | None = None) -> None:
 
 def snapshot(run: Path, step: int) -> Path:
     """Where a run keeps the policy that it had after so many steps."""
+    from metagcttt_tools.common.pretraining_metrics import SNAPSHOTS
+
     return run / SNAPSHOTS / f'{step:06d}'
 
 
@@ -70,6 +75,10 @@ def common_steps(runs: Sequence[Path]) -> list[int]:
     Raises:
         ValueError: If a run has none, or others than the first.
     """
+    from metagcttt_core.training.checkpoint import has_checkpoint
+
+    from metagcttt_tools.common.pretraining_metrics import SNAPSHOTS
+
     found = []
     for run in runs:
         folders = [path for path in (run / SNAPSHOTS).glob('*') if has_checkpoint(path)]
@@ -111,6 +120,10 @@ def curve_rows(results: Sequence[dict[str, Any]], steps: Sequence[int]) -> list[
 
 def curve_picture(rows: Sequence[dict[str, Any]]) -> Figure:
     """Success against pre-training steps, one line a budget with its standard error."""
+    from matplotlib.figure import Figure
+
+    from metagcttt_tools.common.plots import COLORS
+
     figure = Figure(figsize=(5, 3.5), layout='constrained')
     axes = figure.subplots()
     for number, budget in enumerate(dict.fromkeys(row['budget'] for row in rows)):

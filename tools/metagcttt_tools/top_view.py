@@ -1,11 +1,11 @@
 """See a recorded run from above without RViz: a picture or an animation."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from matplotlib.animation import FuncAnimation, PillowWriter
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from metagcttt_core import TrajectoryDataset
 from metagcttt_core.config import assets_dir, Settings
 from metagcttt_core.data import DatasetError
@@ -14,8 +14,12 @@ from pydantic import Field, field_validator
 from sim_bridge.maze_map import MazeMap
 
 from metagcttt_tools.common.cli import fail, parse
-from metagcttt_tools.common.plots import COLORS, draw_maze, draw_segments, save
-from metagcttt_tools.recordings.goal_views import GoalView, read_goal_views
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from metagcttt_tools.recordings.goal_views import GoalView
 
 _DESCRIPTION = """Draw a recording of recorder_node from above: walls, retrieved sub-trajectories,
 the robot's way and its goals, which is what RViz shows of the running robot.
@@ -49,6 +53,9 @@ class TopViewSettings(Settings):
 def main(argv: list[str] | None = None) -> None:
     """Run the tool."""
     settings = parse(TopViewSettings, _DESCRIPTION, 'top-view', argv)
+    from metagcttt_tools.common.plots import save
+    from metagcttt_tools.recordings.goal_views import read_goal_views
+
     try:
         dataset = TrajectoryDataset.load(
             settings.dataset or assets_dir() / _ASSETS / 'dataset.npz'
@@ -68,6 +75,10 @@ def main(argv: list[str] | None = None) -> None:
 
 def picture(maze: MazeMap, views: Sequence[GoalView]) -> Figure:
     """One panel a goal, with the robot's whole way."""
+    from matplotlib.figure import Figure
+
+    from metagcttt_tools.common.plots import COLORS
+
     figure = Figure(figsize=(3 * len(views), 3.4), layout='constrained')
     for axes, view in zip(np.atleast_1d(figure.subplots(1, len(views))), views, strict=True):
         _draw_surroundings(axes, maze, view)
@@ -81,6 +92,11 @@ def picture(maze: MazeMap, views: Sequence[GoalView]) -> Figure:
 
 def animate(maze: MazeMap, views: Sequence[GoalView], frames: int, path: Path) -> None:
     """The goals one after the other, each in `frames` pictures, as a GIF."""
+    from matplotlib.animation import FuncAnimation, PillowWriter
+    from matplotlib.figure import Figure
+
+    from metagcttt_tools.common.plots import COLORS
+
     figure = Figure(figsize=(4, 4.3), layout='constrained')
     axes = figure.subplots()
 
@@ -99,6 +115,8 @@ def animate(maze: MazeMap, views: Sequence[GoalView], frames: int, path: Path) -
 
 
 def _draw_surroundings(axes: Axes, maze: MazeMap, view: GoalView) -> None:
+    from metagcttt_tools.common.plots import draw_maze, draw_segments
+
     draw_maze(axes, maze)
     draw_segments(axes, view.segments)
     axes.plot(*view.goal, marker='*', color='gold', markeredgecolor='black', markersize=14)

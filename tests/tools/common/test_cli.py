@@ -3,6 +3,8 @@
 import importlib
 from importlib.metadata import version
 import re
+import subprocess
+import sys
 
 from metagcttt_core.config import Settings
 from metagcttt_tools.common.cli import fail, parse, preset_values
@@ -248,3 +250,19 @@ def test_unknown_program_is_refused_with_the_known_ones(capsys):
 def test_version_is_that_of_the_package(capsys):
     main(['--version'])
     assert capsys.readouterr().out == f'metagcttt {version("metagcttt-core")}\n'
+
+
+HEAVY = ('torch', 'mujoco', 'ogbench', 'gymnasium', 'matplotlib', 'tensorboard', 'rclpy', 'h5py')
+
+
+@pytest.mark.parametrize('name', ['', *programs()])
+def test_help_imports_nothing_heavy(name):
+    """What takes a second to import waits until it is used."""
+    program = (
+        'import sys; from metagcttt_tools.main import main\n'
+        f'try: main({[*name.split(), "--help"]!r})\n'
+        f'except SystemExit: sys.exit([m for m in {HEAVY!r} if m in sys.modules] or None)'
+    )
+    result = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert 'usage: metagcttt' in result.stdout

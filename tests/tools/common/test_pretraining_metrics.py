@@ -33,7 +33,7 @@ def rates(monkeypatch):
         evaluated.append(weights_of(agent))
         return {'evaluation/success': 0.25}
 
-    monkeypatch.setattr(pretrain, 'success_rates', evaluate)
+    monkeypatch.setattr(pretraining_metrics, 'success_rates', evaluate)
     return evaluated
 
 

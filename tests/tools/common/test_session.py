@@ -9,6 +9,7 @@ import subprocess
 import sys
 
 from metagcttt_core import load_checkpoint, make_agent, save_checkpoint
+from metagcttt_core.meta.diagnostics import Diagnostics
 from metagcttt_core.meta.updates import META_UPDATES
 from metagcttt_core.training.checkpoint import load_training_state
 from metagcttt_tools import meta_train
@@ -46,14 +47,14 @@ def assert_same_bits(first, second):
 
 def interrupt_after(step, monkeypatch):
     """As Ctrl-C would while that outer step is logged."""
-    add = meta_train.Diagnostics.add
+    add = Diagnostics.add
 
     def interrupting(diagnostics, outer):
         add(diagnostics, outer)
         if outer.step == step:
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(meta_train.Diagnostics, 'add', interrupting)
+    monkeypatch.setattr(Diagnostics, 'add', interrupting)
 
 
 @pytest.mark.slow

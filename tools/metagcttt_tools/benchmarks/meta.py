@@ -1,35 +1,26 @@
 """Speed of meta-post-training: an outer step by parts, beside a plain PyTorch loop."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 import cProfile
 from functools import partial
 from pathlib import Path
 import time
 from types import CodeType
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
-from metagcttt_core import (
-    FilterConfig,
-    make_agent,
-    MetaConfig,
-    post_train,
-    TrajectoryDataset,
-    TrajectoryFilter,
-)
-from metagcttt_core.adaptation.batches import QueryBatches
-from metagcttt_core.adaptation.inner_loop import BestStep
-from metagcttt_core.meta.experts import adapt_to_tasks, make_inner_loops
-from metagcttt_core.meta.tasks import TaskSampler
-from metagcttt_core.meta.updates import META_UPDATES
-from metagcttt_core.training.step import gradient_step
+from metagcttt_core import FilterConfig, MetaConfig, TrajectoryDataset, TrajectoryFilter
 import numpy as np
 from pydantic import Field
-import torch
-from torch import nn
 from tqdm import tqdm
 
 from metagcttt_tools.common.cli import parse
 from metagcttt_tools.common.results import Benchmark, markdown_table, write_report
+
+if TYPE_CHECKING:
+    import torch
+    from torch import nn
 
 _DESCRIPTION = """Speed of meta-post-training: an outer step by parts, beside a plain PyTorch loop.
 
@@ -66,6 +57,8 @@ class MetaBenchmark(Benchmark):
 
     def run(self) -> None:
         """Measure, print and write."""
+        import torch
+
         torch.set_num_threads(self.threads)
         dataset = TrajectoryDataset.load(self.dataset)
         outer, parts = self._outer_steps(dataset)
@@ -80,6 +73,8 @@ class MetaBenchmark(Benchmark):
 
     def _outer_steps(self, dataset: TrajectoryDataset) -> tuple[dict[str, Any], list[Any]]:
         """Time of an outer step beside that of its tensor operations alone; and its parts."""
+        from metagcttt_core import make_agent, post_train
+
         agent = make_agent(
             'gcbc',
             obs_dim=dataset.obs_dim,
@@ -114,6 +109,10 @@ class MetaBenchmark(Benchmark):
 
     def _meta_batches(self, dataset: TrajectoryDataset) -> list[dict[str, Any]]:
         """Inner loops one by one and together, for networks of several sizes."""
+        from metagcttt_core import make_agent
+        from metagcttt_core.meta.experts import adapt_to_tasks, make_inner_loops
+        from metagcttt_core.meta.tasks import TaskSampler
+
         rows = []
         sizes = [((32, 32), 64), ((64, 64), 256), ((256, 256, 256), 32), (self.hidden, 256)]
         for hidden, batch_size in tqdm(sizes, unit='size', desc='meta-batches'):
@@ -162,6 +161,9 @@ def plain_outer_step(
     dataset: TrajectoryDataset, hidden: tuple[int, ...], config: MetaConfig
 ) -> Callable[[], None]:
     """The tensor operations of an outer step of GCBC and nothing else, on batches made before."""
+    import torch
+    from torch import nn
+
     widths = (2 * dataset.obs_dim, *hidden)
     layers: list[nn.Module] = []
     for inputs, outputs in zip(widths, hidden, strict=False):
@@ -193,6 +195,12 @@ def plain_outer_step(
 
 def parts_of(profile: cProfile.Profile, config: MetaConfig) -> list[dict[str, Any]]:
     """Milliseconds of each part of an outer step; parts are functions, with all they call."""
+    from metagcttt_core.adaptation.batches import QueryBatches
+    from metagcttt_core.adaptation.inner_loop import BestStep
+    from metagcttt_core.meta.tasks import TaskSampler
+    from metagcttt_core.meta.updates import META_UPDATES
+    from metagcttt_core.training.step import gradient_step
+
     functions: dict[str, tuple[Callable[..., Any], ...]] = {
         'filter': (TrajectoryFilter.query,),
         'task': (TaskSampler.sample,),

@@ -1,23 +1,26 @@
 """The three nodes killed and started again, and ended by a signal: how long each takes."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from contextlib import ExitStack
 import os
 from pathlib import Path
 import signal
 import time
+from typing import TYPE_CHECKING
 
-from metagcttt.commander import NoAnswerError, RobotCommander, SentGoal
-from metagcttt_interfaces.action import ReachGoal
 import numpy as np
 from pydantic import Field
-import rclpy
 from tqdm import tqdm
 
 from metagcttt_tools.common.cli import parse
 from metagcttt_tools.common.results import Benchmark, markdown_table, write_report
-from metagcttt_tools.graph.drive import own_domain
-from metagcttt_tools.graph.process import NodeFailedError, NodeProcess
+
+if TYPE_CHECKING:
+    from metagcttt.commander import RobotCommander, SentGoal
+
+    from metagcttt_tools.graph.process import NodeProcess
 
 _GOAL = (20.0, 20.0)
 _ENDLESS_STEPS = 10000
@@ -57,6 +60,11 @@ class RestartsBenchmark(Benchmark):
             NodeFailedError: If a node ends by itself, or by an exit status other than 0.
             NoAnswerError: If a node does not serve in time.
         """
+        from metagcttt.commander import RobotCommander
+        import rclpy
+
+        from metagcttt_tools.graph.drive import own_domain
+
         load = os.getloadavg()[0]
         with own_domain(), ExitStack() as stack, tqdm(total=2 * self.repeats, unit='round') as bar:
             rclpy.init()
@@ -102,6 +110,8 @@ class RestartsBenchmark(Benchmark):
 
     def _end_each(self, commander: RobotCommander) -> dict[str, float]:
         """Seconds from Ctrl-C to the end of the process, by node; the policy is adapting."""
+        from metagcttt_tools.graph.process import NodeFailedError
+
         seconds = {}
         with ExitStack() as stack:
             nodes = {name: self._start(stack, name) for name in ('sim_bridge_node', 'goal_node')}
@@ -116,6 +126,8 @@ class RestartsBenchmark(Benchmark):
         return seconds
 
     def _start(self, stack: ExitStack, name: str, **parameters: int) -> NodeProcess:
+        from metagcttt_tools.graph.process import NodeProcess
+
         log = self.out / f'{name}.log'
         return stack.enter_context(NodeProcess(name, {**_NODES[name], **parameters}, log))
 
@@ -125,6 +137,8 @@ def _is_adapted(sent: SentGoal) -> bool:
 
 
 def _is_adapting(sent: SentGoal) -> bool:
+    from metagcttt_interfaces.action import ReachGoal
+
     return sent.feedback is not None and sent.feedback.phase == ReachGoal.Feedback.ADAPTING
 
 
@@ -138,6 +152,8 @@ def drive(
     Raises:
         NoAnswerError: If none is within `timeout_s`.
     """
+    from metagcttt.commander import NoAnswerError
+
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:
         try:

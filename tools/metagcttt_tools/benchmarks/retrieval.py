@@ -1,25 +1,27 @@
 """Cost of filtering: the index against a scan of the dataset, without and with a critic."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from pathlib import Path
 import time
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
-from matplotlib.figure import Figure
 from metagcttt_core import TrajectoryDataset, TrajectoryFilter
-from metagcttt_core.agents.gciql import GCIQL, GCIQLSettings
+from metagcttt_core.agents.config import GCIQLSettings
 import numpy as np
 from pydantic import Field
 from sim_bridge.generation.behaviours import Kind
 from sim_bridge.generation.generate import generate
 from sim_bridge.generation.plan import plan_dataset
-import torch
 from tqdm import tqdm
 
 from metagcttt_tools.benchmarks.scan import scan
 from metagcttt_tools.common.cli import parse
-from metagcttt_tools.common.plots import COLORS, save
 from metagcttt_tools.common.results import Benchmark, markdown_table, write_report
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _ENVIRONMENT = 'pointmaze-medium-v0'
 _JITTER_M = 0.05
@@ -48,6 +50,10 @@ class RetrievalBenchmark(Benchmark):
 
     def run(self) -> None:
         """Measure, print and write."""
+        import torch
+
+        from metagcttt_tools.common.plots import save
+
         torch.set_num_threads(1)
         critic_free, critic_based = [], []
         for kind in ('navigate', 'stitch'):
@@ -112,6 +118,9 @@ class RetrievalBenchmark(Benchmark):
 
     def _critic_based(self, name: str, dataset: TrajectoryDataset) -> dict[str, Any]:
         """First query of a goal, the same again, and other places after a prefetch."""
+        from metagcttt_core.agents.gciql import GCIQL
+        import torch
+
         agent = GCIQL(
             dataset.obs_dim,
             dataset.act_dim,
@@ -178,6 +187,10 @@ def enlarged(dataset: TrajectoryDataset, factor: float, seed: int) -> Trajectory
 
 def cost_picture(sizes: list[dict[str, Any]]) -> Figure:
     """Milliseconds per query against dataset size, scan and index."""
+    from matplotlib.figure import Figure
+
+    from metagcttt_tools.common.plots import COLORS
+
     figure = Figure(figsize=(5, 3.5), layout='constrained')
     axes = figure.subplots()
     transitions = [row['transitions'] for row in sizes]

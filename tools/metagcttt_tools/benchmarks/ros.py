@@ -1,25 +1,26 @@
 """The policy node over DDS: latency, deadlines and the time a goal costs."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from functools import partial
 from itertools import cycle
 import os
 from pathlib import Path
 import tempfile
-from typing import Any, Literal
+from typing import Any, Literal, TYPE_CHECKING
 
-from metagcttt_core import make_agent, save_checkpoint, TrajectoryDataset
+from metagcttt_core import TrajectoryDataset
 from metagcttt_core.config import assets_dir
 import numpy as np
 from pydantic import Field
-import rclpy
 from tqdm import tqdm
 
-from metagcttt_tools.benchmarks.state_source import Answers, StateSource
 from metagcttt_tools.common.cli import parse
 from metagcttt_tools.common.results import Benchmark, markdown_table, write_report
-from metagcttt_tools.graph.drive import own_domain
-from metagcttt_tools.graph.process import NodeProcess
+
+if TYPE_CHECKING:
+    from metagcttt_tools.benchmarks.state_source import Answers, StateSource
 
 _ENDLESS_STEPS = 10000
 _WARM_UP_S = 2.0
@@ -62,6 +63,13 @@ class RosBenchmark(Benchmark):
 
     def run(self) -> None:
         """Measure, print and write."""
+        from metagcttt_core import make_agent, save_checkpoint
+        import rclpy
+
+        from metagcttt_tools.benchmarks.state_source import StateSource
+        from metagcttt_tools.graph.drive import own_domain
+        from metagcttt_tools.graph.process import NodeProcess
+
         dataset = TrajectoryDataset.load(
             assets_dir() / 'pointmaze-medium-navigate' / 'dataset.npz'
         )

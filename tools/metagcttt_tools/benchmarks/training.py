@@ -1,26 +1,27 @@
 """Cost of a training step: the whole update against the bare matrix products inside it."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from pathlib import Path
 import time
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TYPE_CHECKING
 
-from metagcttt_core import Agent, make_agent
-from metagcttt_core.agents import AgentName, TensorBatch
-from metagcttt_core.training.numerics import loss_function, Precision
-from metagcttt_core.training.optimizers import make_optimizer
-from metagcttt_core.training.step import gradient_step
+from metagcttt_core.agents import AgentName
+from metagcttt_core.training.config import Precision
 import numpy as np
 from pydantic import Field
-import torch
-from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
 from tqdm import tqdm
 
 from metagcttt_tools.common.cli import parse
 from metagcttt_tools.common.results import Benchmark, markdown_table, write_report
 
-Product = tuple[Tensor, Tensor]
+if TYPE_CHECKING:
+    from metagcttt_core import Agent
+    from metagcttt_core.agents import TensorBatch
+    from torch import Tensor
+
+    Product = tuple[Tensor, Tensor]
 
 
 class Size(NamedTuple):
@@ -78,6 +79,8 @@ class TrainingBenchmark(Benchmark):
 
     def run(self) -> None:
         """Measure, print and write."""
+        import torch
+
         rows = []
         total = len(self.threads) * len(self.sizes) * len(LEARNERS) * len(self.precisions)
         with tqdm(total=total, unit='row', desc='training') as bar:
@@ -93,6 +96,9 @@ class TrainingBenchmark(Benchmark):
         print(f'results: {self.out}')
 
     def _row(self, learner: Learner, size: Size, precision: Precision) -> dict[str, Any]:
+        from metagcttt_core import make_agent
+        import torch
+
         hidden = (size.units,) * size.layers
         agent = make_agent(
             learner.agent,
@@ -122,34 +128,36 @@ class TrainingBenchmark(Benchmark):
         return row
 
 
-class _ProductRecorder(TorchDispatchMode):
-    """Keeps the operands of every matrix product that runs."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.products: list[Product] = []
-
-    def __torch_dispatch__(
-        self, func: Any, types: Any, args: tuple = (), kwargs: dict | None = None
-    ) -> Any:
-        if func is torch.ops.aten.mm.default:
-            self.products.append((args[0], args[1]))
-        elif func is torch.ops.aten.addmm.default:
-            self.products.append((args[1], args[2]))
-        return func(*args, **(kwargs or {}))
-
-
 def products_of(update: Callable[[], Any]) -> list[Product]:
     """The operands of each matrix product of an update, in order, forward and backward."""
-    with _ProductRecorder() as recorder:
+    import torch
+    from torch.utils._python_dispatch import TorchDispatchMode
+
+    products: list[Product] = []
+
+    class Recorder(TorchDispatchMode):
+        def __torch_dispatch__(
+            self, func: Any, types: Any, args: tuple = (), kwargs: dict | None = None
+        ) -> Any:
+            if func is torch.ops.aten.mm.default:
+                products.append((args[0], args[1]))
+            elif func is torch.ops.aten.addmm.default:
+                products.append((args[1], args[2]))
+            return func(*args, **(kwargs or {}))
+
+    with Recorder():
         update()
-    return [(first.detach(), second.detach()) for first, second in recorder.products]
+    return [(first.detach(), second.detach()) for first, second in products]
 
 
 def update_of(
     agent: Agent, batch: TensorBatch, precision: Precision, *, compiled: bool
 ) -> Callable[[], Any]:
     """One gradient step of the agent on the batch, ready to be repeated."""
+    from metagcttt_core.training.numerics import loss_function
+    from metagcttt_core.training.optimizers import make_optimizer
+    from metagcttt_core.training.step import gradient_step
+
     parameters = list(agent.trained_parameters())
     optimizer = make_optimizer('adam', parameters, 3e-4)
     losses = loss_function(agent, precision=precision, compiled=compiled)

@@ -11,7 +11,8 @@ from metagcttt_core import (
     TrajectoryDataset,
 )
 from metagcttt_core.data import GoalRelabeller
-from metagcttt_core.training.numerics import loss_function, Precision
+from metagcttt_core.training.config import Precision
+from metagcttt_core.training.numerics import loss_function
 import numpy as np
 from sim_bridge import make_simulator
 from torch import no_grad, Tensor

@@ -8,7 +8,6 @@ from typing import Any, Self
 
 from metagcttt_core.files import atomic_write
 import numpy as np
-from torch.utils.tensorboard import SummaryWriter
 
 METRICS = 'metrics.jsonl'
 
@@ -22,6 +21,8 @@ class RunLog:
 
     def __init__(self, folder: Path, first_step: int) -> None:
         """Open the logs in `folder`; lines of a resumed run beyond `first_step` are dropped."""
+        from torch.utils.tensorboard import SummaryWriter
+
         path = folder / METRICS
         self.records: list[dict[str, Any]] = []
         if first_step > 0 and path.exists():

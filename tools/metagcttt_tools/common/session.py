@@ -1,5 +1,7 @@
 """What the long-running tools share: logs, provenance, interruption."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,20 +12,18 @@ import signal
 import subprocess
 import sys
 import threading
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from metagcttt_core.config import Settings
 from metagcttt_core.files import write_json
-from metagcttt_core.meta.parallel import any_process, first_process
-from metagcttt_core.training.checkpoint import has_checkpoint, load_training_state
-from metagcttt_core.training.run import TrainingInterrupted, TrainingRun
 from pydantic import Field, field_validator
-import torch
-from torch import distributed
 from tqdm import tqdm
 
 from metagcttt_tools.common.cli import fail
 from metagcttt_tools.common.run_log import RunLog, SilentLog
+
+if TYPE_CHECKING:
+    from metagcttt_core.training.run import TrainingRun
 
 _PACKAGES = ('torch', 'numpy', 'mujoco', 'ogbench')
 
@@ -45,6 +45,8 @@ class RunSettings(Settings):
     @field_validator('device')
     @classmethod
     def _must_be_here(cls, device: str) -> str:
+        import torch
+
         kind, _, number = device.partition(':')
         count = {'cpu': 1, 'cuda': torch.cuda.device_count()}.get(kind, 0)
         if not (number or '0').isdigit() or int(number or '0') >= count:
@@ -92,6 +94,11 @@ def training_session(
         SystemExit: With status 130 after Ctrl-C or SIGTERM, everything done so far being saved;
             with status 2 when something cannot be written, the last checkpoint being left whole.
     """
+    from metagcttt_core.meta.parallel import any_process, first_process
+    from metagcttt_core.training.checkpoint import has_checkpoint, load_training_state
+    from metagcttt_core.training.run import TrainingInterrupted, TrainingRun
+    import torch
+
     folder = settings.checkpoint_folder
     exists = has_checkpoint(folder)
     if exists and not settings.resume:
@@ -128,6 +135,8 @@ def training_session(
 
 def left_behind(settings: RunSettings) -> str:
     """What there is to go on from after a failure, in words."""
+    from metagcttt_core.training.checkpoint import has_checkpoint, load_training_state
+
     if not has_checkpoint(settings.checkpoint_folder):
         return 'there is no checkpoint yet'
     step = load_training_state(settings.checkpoint_folder).step
@@ -137,6 +146,9 @@ def left_behind(settings: RunSettings) -> str:
 @contextmanager
 def process_group(device: str) -> Iterator[None]:
     """Connects the processes that `torchrun` started; without it there is nothing to connect."""
+    import torch
+    from torch import distributed
+
     if not distributed.is_torchelastic_launched():
         yield
         return
@@ -189,4 +201,6 @@ def write_settings(folder: Path, settings: Settings) -> None:
 
 def use_threads(count: int) -> None:
     """Threads for tensor operations; results are repeatable for an equal count."""
+    import torch
+
     torch.set_num_threads(count)

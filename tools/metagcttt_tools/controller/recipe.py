@@ -5,7 +5,7 @@ import math
 
 from sim_bridge.controllers.humanoid_ground import Course
 
-from metagcttt_tools.controller.sac import SACConfig
+from metagcttt_tools.controller.config import SACConfig
 
 SAC_CONFIG = SACConfig(
     critic_lr=5e-4,
