@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 import copy
+import hashlib
 import math
 from typing import Any, ClassVar, Self
 
@@ -75,6 +76,14 @@ class Agent(nn.Module, ABC):
         """The parameters an optimiser steps on."""
         module = self.actor if actor_only else self
         return (parameter for parameter in module.parameters() if parameter.requires_grad)
+
+    def fingerprint(self) -> str:
+        """Hash of all weights, 16 hexadecimal digits."""
+        digest = hashlib.blake2b(digest_size=8)
+        for name, weight in self.state_dict().items():
+            digest.update(f'{name}{tuple(weight.shape)}'.encode())
+            digest.update(weight.cpu().numpy().tobytes())
+        return digest.hexdigest()
 
     def clone(self) -> Self:
         """An independent copy with equal weights."""

@@ -1,6 +1,8 @@
 """The offline dataset D: trajectories in memory or memory-mapped."""
 
 from collections.abc import Mapping
+from functools import cached_property
+import hashlib
 from pathlib import Path
 from typing import Self
 
@@ -8,6 +10,8 @@ import numpy as np
 
 from metagcttt_core.data import checks, minari, npz
 from metagcttt_core.data.errors import DatasetError
+
+_CHUNK_ROWS = 1 << 20
 
 
 class TrajectoryDataset:
@@ -174,6 +178,16 @@ class TrajectoryDataset:
     def act_dim(self) -> int:
         """Width of an action."""
         return self.actions.shape[1]
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Hash of all observations, actions and terminals, 16 hexadecimal digits."""
+        digest = hashlib.blake2b(digest_size=8)
+        for array in (self.observations, self.actions, self.terminals):
+            digest.update(f'{array.dtype.str}{array.shape}'.encode())
+            for start in range(0, len(array), _CHUNK_ROWS):
+                digest.update(np.ascontiguousarray(array[start : start + _CHUNK_ROWS]).data)
+        return digest.hexdigest()
 
     def episode_of(self, rows: np.ndarray) -> np.ndarray:
         """The trajectory number of each row, int64 of the same shape."""

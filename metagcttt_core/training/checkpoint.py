@@ -166,6 +166,14 @@ def load_checkpoint(
     return agent
 
 
+def steps_done(path: str | Path) -> int:
+    """Steps of the run that wrote the checkpoint in `path`; 0 without one."""
+    if not has_checkpoint(path):
+        return 0
+    training = _read_index(_folder(path)).training
+    return training.step if training is not None else 0
+
+
 def load_training_state(path: str | Path) -> TrainingState:
     """The state of the run that wrote the checkpoint in `path`.
 

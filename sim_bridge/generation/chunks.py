@@ -77,13 +77,25 @@ class ChunkFolder:
         """
         file = self.path / _SETTINGS
         if file.exists():
-            refuse_difference(self.path, json.loads(file.read_text(encoding='utf-8')), settings)
+            refuse_difference(self.path, self.settings(), settings)
             return
         try:
             claim_folder(self.path)
         except FileExistsError as error:
             raise GenerationError(str(error)) from error
         write_json(file, settings)
+
+    def settings(self) -> dict[str, Any]:
+        """The settings of the chunks.
+
+        Raises:
+            GenerationError: If their file is damaged.
+        """
+        file = self.path / _SETTINGS
+        try:
+            return json.loads(file.read_text(encoding='utf-8'))
+        except ValueError as error:
+            raise GenerationError(f'{file} is damaged ({error}): remove {self.path}') from error
 
     def exists(self) -> bool:
         """True if a dataset is in progress here."""

@@ -146,6 +146,17 @@ def generate(
     return statistics
 
 
+def kept_settings(output: Path) -> tuple[Path, dict[str, Any]] | None:
+    """The settings of a dataset in progress or complete, and their file; None without any."""
+    paths = OutputPaths(output)
+    partial = ChunkFolder(paths.partial)
+    if partial.exists():
+        return paths.partial, partial.settings()
+    if paths.sidecar.exists():
+        return paths.sidecar, _stored(paths.sidecar)[0]
+    return None
+
+
 def _settings(plan: GenerationPlan, follower: DirectionFollower) -> dict[str, Any]:
     """All settings that determine the content of a dataset."""
     controller = (

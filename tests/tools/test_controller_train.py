@@ -63,7 +63,7 @@ def test_resumed_run_keeps_the_transitions_and_goes_on(
     before = load_file(trained / 'checkpoint.safetensors')
     with pytest.raises(SystemExit):
         train(trained, 60)
-    assert 'go on with --resume' in capsys.readouterr().err
+    assert 'pass --resume' in capsys.readouterr().err
     train(trained, 60, '--resume')
     after = load_file(trained / 'checkpoint.safetensors')
     for name in ('observations', 'actions', 'rewards', 'masks'):
@@ -73,7 +73,7 @@ def test_resumed_run_keeps_the_transitions_and_goes_on(
     assert not torch.equal(after['actor.weights.0'], before['actor.weights.0'])
     with pytest.raises(SystemExit):
         train(trained, 80, '--resume', '--sac.lr', '0.1')
-    assert 'cannot resume, sac was' in capsys.readouterr().err
+    assert 'cannot resume, sac.lr was' in capsys.readouterr().err
 
 
 def test_stopped_run_saves_every_step_so_far(tmp_path: Path) -> None:

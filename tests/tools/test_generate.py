@@ -103,7 +103,7 @@ def test_ctrl_c_ends_with_status_130_and_says_how_to_go_on(
     with pytest.raises(SystemExit) as stop:
         generate.main(SMALL)
     assert stop.value.code == 130
-    assert 'the same command with --resume goes on' in capsys.readouterr().err
+    assert 'pass --resume to continue' in capsys.readouterr().err
 
 
 def test_runs_as_a_module() -> None:

@@ -66,7 +66,7 @@ def test_pretrain_writes_checkpoint_logs_and_settings(base):
 def test_pretrain_does_not_overwrite_a_checkpoint(dataset_path, base, capsys):
     with pytest.raises(SystemExit, match='2'):
         pretrain.main(pretrain_arguments(dataset_path, base.parent, steps=20))
-    assert 'go on with --resume' in capsys.readouterr().err
+    assert 'pass --resume to continue' in capsys.readouterr().err
 
 
 def test_resume_refuses_other_settings_by_name(dataset_path, base, capsys):

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 import json
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
-from metagcttt_core.config import Settings
 from metagcttt_core.files import atomic_write
 import numpy as np
 from pydantic import Field
@@ -17,6 +16,7 @@ from sim_bridge.controllers.training_ground import TrainingGround
 from tqdm import tqdm
 
 from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.resume import nested, Resumable
 from metagcttt_tools.common.run_log import RunLog
 from metagcttt_tools.common.session import provenance, stop_on_signal, use_threads, write_settings
 from metagcttt_tools.controller.config import SACConfig
@@ -28,11 +28,14 @@ _DESCRIPTION = """Train the controller that walks the ant along a direction (SAC
 
 Example: metagcttt controller train --out out/ant-controller
 Writes OUT/controller, OUT/checkpoint.safetensors (replay buffer included) and logs.
-Ctrl-C saves and ends; --resume goes on, with a new episode."""
+Ctrl-C saves and ends; --resume, with no other flag than --out, continues with a new episode."""
 
 
-class TrainControllerSettings(Settings):
-    """Settings of the tool."""
+class TrainControllerSettings(Resumable):
+    """Settings of the program."""
+
+    may_change = frozenset({'checkpoint_every', 'log_every', 'decay_steps'})
+    may_grow = frozenset({'steps'})
 
     out: Path = Field(Path('out/ant-controller'), description='folder of the run')
     steps: int = Field(200_000, ge=1, description='environment steps')
@@ -43,11 +46,10 @@ class TrainControllerSettings(Settings):
     replay_size: int = Field(1_000_000, ge=1, description='latest transitions to learn from')
     random_steps: int = Field(5000, ge=1, description='uniformly random actions at the start')
     sac: SACConfig = SACConfig()
-    seed: int = Field(0, ge=0, description='of everything random')
+    seed: int = Field(0, ge=0, description='random seed')
     checkpoint_every: int = Field(20_000, ge=1, description='steps between checkpoints')
     log_every: int = Field(2000, ge=1, description='steps between log lines')
     threads: int = Field(1, ge=1, description='threads for tensor operations')
-    resume: bool = Field(False, description='go on from the checkpoint in OUT, if there is one')
 
     @property
     def checkpoint(self) -> Path:
@@ -123,7 +125,7 @@ class ControllerTraining:
         metadata = {
             'steps': self.replay.added,
             'decay_steps': self.settings.decay_steps,
-            'training': _decisive(self.settings),
+            'training': nested(self.settings.decisive()),
             **provenance(),
         }
         return LearnedFollower('ant', tuple(weights), tuple(biases), metadata)
@@ -134,7 +136,7 @@ class ControllerTraining:
 
         self.follower().save(self.settings.out / 'controller')
         tensors = {**self.learner.tensors(), **self.replay.tensors()}
-        metadata = {'settings': json.dumps(_decisive(self.settings))}
+        metadata = {'settings': json.dumps(self.settings.decisive())}
         with atomic_write(self.settings.checkpoint) as file:
             file.write(safetensors.torch.save(tensors, metadata))
 
@@ -148,7 +150,7 @@ class ControllerTraining:
         with safe_open(path, framework='pt') as file:
             stored = json.loads(file.metadata()['settings'])
             tensors = {name: file.get_tensor(name) for name in file.keys()}
-        for name, asked in _decisive(self.settings).items():
+        for name, asked in self.settings.decisive().items():
             if stored.get(name) != asked:
                 raise ValueError(
                     f'{path}: cannot resume, {name} was {stored.get(name)!r} and is now {asked!r}'
@@ -203,7 +205,7 @@ def _run(settings: TrainControllerSettings) -> None:
     training = ControllerTraining(settings)
     if settings.checkpoint.exists():
         if not settings.resume:
-            fail(f'{settings.checkpoint} exists: go on with --resume, or choose another --out')
+            fail(f'{settings.checkpoint} exists: pass --resume or choose another --out')
         training.restore()
     write_settings(settings.out, settings)
     first = training.replay.added
@@ -220,12 +222,6 @@ def _run(settings: TrainControllerSettings) -> None:
 
         finished = training.run(log, stop.is_set)
     if not finished:
-        print(f'stopped after step {training.replay.added}; go on with --resume')
+        print(f'stopped after step {training.replay.added}; pass --resume to continue')
         raise SystemExit(130)
     print(f'controller: {settings.out / "controller"}')
-
-
-def _decisive(settings: TrainControllerSettings) -> dict[str, Any]:
-    """The settings that decide the course; how long it goes on may change on the way."""
-    fields = {'update_every', 'replay_size', 'random_steps', 'sac', 'seed', 'threads'}
-    return settings.model_dump(mode='json', include=fields)

@@ -3,11 +3,11 @@
 from dataclasses import replace
 from pathlib import Path
 
-from metagcttt_core.config import Settings
 from pydantic import Field
 from tqdm import tqdm
 
 from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.resume import Resumable
 from metagcttt_tools.common.run_log import RunLog
 from metagcttt_tools.common.session import stop_on_signal, use_threads, write_settings
 
@@ -16,11 +16,13 @@ _DESCRIPTION = """Train the controller that walks the humanoid along a direction
 Example: metagcttt controller train-humanoid --out out/humanoid-controller
 Three stages: to walk on a floor, to bear noise and pushes, to walk in mazes.
 Writes OUT/controller, OUT/checkpoint.safetensors (replay buffer included) and logs.
-Ctrl-C saves and ends; --resume goes on to the same end."""
+Ctrl-C saves and ends; --resume, with no other flag than --out, continues."""
 
 
-class TrainHumanoidSettings(Settings):
-    """Settings of the tool."""
+class TrainHumanoidSettings(Resumable):
+    """Settings of the program."""
+
+    may_change = frozenset({'checkpoint_every', 'log_every', 'threads'})
 
     out: Path = Field(Path('out/humanoid-controller'), description='folder of the run')
     length: float = Field(1.0, gt=0, description='of each stage, as a share of the usual length')
@@ -28,7 +30,6 @@ class TrainHumanoidSettings(Settings):
     checkpoint_every: int = Field(2500, ge=1, description='sweeps between checkpoints')
     log_every: int = Field(250, ge=1, description='sweeps between log lines')
     threads: int = Field(1, ge=1, description='threads for tensor operations')
-    resume: bool = Field(False, description='go on from the checkpoint in OUT, if there is one')
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -51,7 +52,7 @@ def _run(settings: TrainHumanoidSettings) -> None:
     training = HumanoidTraining(settings.out, settings.seed, stages)
     if training.checkpoint.exists():
         if not settings.resume:
-            fail(f'{training.checkpoint} exists: go on with --resume, or choose another --out')
+            fail(f'{training.checkpoint} exists: pass --resume or choose another --out')
         training.restore()
     write_settings(settings.out, settings)
     first = training.sweep
@@ -68,6 +69,6 @@ def _run(settings: TrainHumanoidSettings) -> None:
 
         finished = training.run(log, stop.is_set, settings.log_every, settings.checkpoint_every)
     if not finished:
-        print(f'stopped after sweep {training.sweep}; go on with --resume')
+        print(f'stopped after sweep {training.sweep}; pass --resume to continue')
         raise SystemExit(130)
     print(f'controller: {settings.out / "controller"}')

@@ -5,7 +5,7 @@ from concurrent.futures import as_completed, ProcessPoolExecutor
 import multiprocessing
 from pathlib import Path
 import sys
-from typing import Any
+from typing import Any, ClassVar
 
 from metagcttt_core import (
     FilterConfig,
@@ -25,13 +25,14 @@ from tqdm import tqdm
 
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.job_log import JobLog
+from metagcttt_tools.common.resume import Resumable
 from metagcttt_tools.common.session import provenance, use_threads
 
 _DESCRIPTION = """Success of policies by test-time training budget.
 
 Example: metagcttt evaluate --checkpoints out/pretrain/checkpoint out/meta/checkpoint
 Prints a table with standard errors over seeds and writes OUT as JSON.
-Ctrl-C is safe: --resume goes on."""
+Ctrl-C is safe; --resume, with no other flag than --out, continues."""
 
 
 Job = tuple[str, str, int, int, int]
@@ -53,14 +54,22 @@ class EpisodeSettings(Settings):
     seeds: tuple[int, ...] = Field((0, 1, 2), min_length=1, description='evaluation seeds')
 
 
-class ProtocolSettings(EpisodeSettings):
+class ProtocolSettings(Resumable, EpisodeSettings):
     """How policies are evaluated."""
+
+    # The data are known by their content, wherever they are.
+    may_change: ClassVar[frozenset[str]] = frozenset({'dataset', 'processes'})
 
     actor_loss: ActorLoss | None = Field(
         None, description="to adapt GCIQL policies with; each policy's own by default"
     )
     processes: int = Field(2, ge=1, description='processes to spread the work over')
-    resume: bool = Field(False, description='keep what an interrupted call finished')
+    out: Path = Field(Path('out/evaluation.json'), description='file for the results')
+
+    def kept(self) -> tuple[Path, Mapping[str, Any]] | None:
+        """The settings of an interrupted call, which its log of finished jobs begins with."""
+        log = finished_jobs(self.out)
+        return (log, JobLog.settings(log)['program']) if log.exists() else None
 
 
 class EvaluateSettings(ProtocolSettings):
@@ -69,18 +78,17 @@ class EvaluateSettings(ProtocolSettings):
     checkpoints: tuple[Path, ...] = Field(
         (Path('out/pretrain/checkpoint'),), min_length=1, description='policies to evaluate'
     )
-    out: Path = Field(Path('out/evaluation.json'), description='file for the results')
 
 
 def main(argv: list[str] | None = None) -> None:
     """Run the tool."""
     settings = parse(EvaluateSettings, _DESCRIPTION, 'evaluate', argv)
     try:
-        results = evaluate(settings)
+        results = evaluate(settings, settings)
     except ValueError as error:
         fail(str(error))
     except KeyboardInterrupt:
-        print('interrupted; the same command with --resume goes on', file=sys.stderr)
+        print('interrupted; pass --resume to continue', file=sys.stderr)
         raise SystemExit(130) from None
     report = {'settings': settings.model_dump(mode='json'), **provenance(), 'results': results}
     write_json(settings.out, report)
@@ -88,8 +96,13 @@ def main(argv: list[str] | None = None) -> None:
     print(f'results: {settings.out}')
 
 
-def evaluate(settings: EvaluateSettings) -> list[dict[str, Any]]:
-    """Success by policy and budget: rates per seed, their mean and error, and the AUC."""
+def evaluate(settings: EvaluateSettings, program: Resumable) -> list[dict[str, Any]]:
+    """Success by policy and budget: rates per seed, their mean and error, and the AUC.
+
+    Args:
+        settings: What to evaluate.
+        program: The settings to continue with after an interruption.
+    """
     environments = [environment_of(path) for path in settings.checkpoints]
     num_tasks = make_simulator(environments[0]).spec.num_tasks
     jobs = [
@@ -99,7 +112,7 @@ def evaluate(settings: EvaluateSettings) -> list[dict[str, Any]]:
         for seed in settings.seeds
         for task in range(1, num_tasks + 1)
     ]
-    rates = _run_jobs(settings, jobs)
+    rates = _run_jobs(settings, program, jobs)
     results = []
     for path, environment in zip(settings.checkpoints, environments, strict=True):
         curve = []
@@ -149,11 +162,23 @@ def format_table(results: list[dict[str, Any]]) -> str:
     return '\n'.join(lines)
 
 
-def _run_jobs(settings: EvaluateSettings, jobs: list[Job]) -> dict[Job, float]:
+def finished_jobs(out: Path) -> Path:
+    """The log of the jobs that an evaluation has finished, while it is under way."""
+    return out.with_suffix('.partial.jsonl')
+
+
+def _run_jobs(settings: EvaluateSettings, program: Resumable, jobs: list[Job]) -> dict[Job, float]:
     """Success rate of every job; jobs run in separate processes and are kept as they finish."""
-    decisive = settings.model_dump(mode='json', exclude={'processes', 'out', 'resume'})
-    path = settings.out.with_suffix('.partial.jsonl')
-    log: JobLog[Job] = JobLog(path, decisive, resume=settings.resume)
+    from metagcttt_core import load_checkpoint
+
+    decisive = settings.decisive()
+    decisive['dataset'] = TrajectoryDataset.load(settings.dataset).fingerprint
+    decisive['policies'] = [load_checkpoint(path).fingerprint() for path in settings.checkpoints]
+    log: JobLog[Job] = JobLog(
+        finished_jobs(settings.out),
+        {'decisive': decisive, 'program': program.model_dump(mode='json')},
+        resume=settings.resume,
+    )
     pool = ProcessPoolExecutor(
         settings.processes,
         mp_context=multiprocessing.get_context('spawn'),

@@ -1,20 +1,22 @@
 """Generate an offline dataset of a maze: navigate, stitch or explore, in OGBench's format."""
 
+from collections.abc import Mapping
 import os
 from pathlib import Path
 import sys
 import time
+from typing import Any
 
 from metagcttt_core import TrajectoryDataset
-from metagcttt_core.config import Settings
 from pydantic import Field
 from sim_bridge import describe_environment
 from sim_bridge.generation.behaviours import Kind
-from sim_bridge.generation.generate import generate, OutputPaths
+from sim_bridge.generation.generate import generate, kept_settings, OutputPaths
 from sim_bridge.generation.plan import plan_dataset
 from tqdm import tqdm
 
 from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.resume import Resumable
 
 DESCRIPTION = """Generate an offline dataset of a maze in OGBench's npz format.
 
@@ -24,7 +26,8 @@ A behaviour policy walks the robot through the maze with noisy actions:
   explore   a new random direction every ten steps
 
 Without further flags the dataset has OGBench's size and noise. The same settings give the same
-files on any number of processes. Ctrl-C is safe: --resume goes on.
+files on any number of processes. Ctrl-C is safe: --resume, with no
+other flag than --output, continues.
 
 Example, 1000 episodes of 1001 rows, about two minutes on one core:
 
@@ -38,8 +41,11 @@ another. The humanoid starts on its feet, and its episodes end a second before a
 Where there is a network, metagcttt download fetches OGBench's published files instead."""
 
 
-class GenerateSettings(Settings):
+class GenerateSettings(Resumable):
     """Settings of one generated dataset."""
+
+    may_change = frozenset({'processes', 'controller', 'overwrite'})
+    place = 'output'
 
     environment: str = Field('pointmaze-medium-v0', description='Name of the maze.')
     kind: Kind = Field('navigate', description='What the behaviour policy is after.')
@@ -56,7 +62,7 @@ class GenerateSettings(Settings):
         False,
         description="Walk to the goal itself; OGBench walks to the center of the goal's cell.",
     )
-    seed: int = Field(0, ge=0, description='Seed of everything random.')
+    seed: int = Field(0, ge=0, description='Random seed.')
     output: Path | None = Field(
         None, description='Path ending in .npz; data/MAZE-KIND-v0.npz by default.'
     )
@@ -68,8 +74,21 @@ class GenerateSettings(Settings):
     controller: Path | None = Field(
         None, description='Folder of a learned controller; the one of the package by default.'
     )
-    resume: bool = Field(False, description='Go on with what an interrupted run left.')
     overwrite: bool = Field(False, description='Replace an existing dataset.')
+
+    @property
+    def file(self) -> Path:
+        """The dataset to write, by default named as OGBench names it."""
+        maze = describe_environment(self.environment).spec.name.removesuffix('-v0')
+        return self.output or Path('data') / f'{maze}-{self.kind}-v0.npz'
+
+    def kept(self) -> tuple[Path, Mapping[str, Any]] | None:
+        """The settings of the dataset that is in progress or complete."""
+        kept = kept_settings(self.file)
+        if kept is None:
+            return None
+        file, values = kept
+        return file, {name: values[name] for name in values if name in type(self).model_fields}
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -80,7 +99,7 @@ def main(argv: list[str] | None = None) -> None:
     except ValueError as error:
         fail(str(error))
     except KeyboardInterrupt:
-        print('interrupted; the same command with --resume goes on', file=sys.stderr)
+        print('interrupted; pass --resume to continue', file=sys.stderr)
         raise SystemExit(130) from None
 
 
@@ -95,7 +114,7 @@ def _run(settings: GenerateSettings) -> None:
         noise=settings.noise,
         to_goal=settings.to_goal,
     )
-    output = settings.output or default_output(plan.environment, plan.kind)
+    output = settings.file
     with tqdm(unit=' episodes', desc=output.stem, delay=0.5) as bar:
 
         def show(done: int, total: int) -> None:
@@ -129,8 +148,3 @@ def _draw(environment: str, dataset: Path, picture: Path) -> None:
     description = describe_environment(environment)
     positions = TrajectoryDataset.load(dataset).observations[:, description.spec.position_dims]
     save(coverage_picture(description.maze, positions), picture)
-
-
-def default_output(environment: str, kind: Kind) -> Path:
-    """Where a dataset goes by default, named as OGBench names it."""
-    return Path('data') / f'{environment.removesuffix("-v0")}-{kind}-v0.npz'

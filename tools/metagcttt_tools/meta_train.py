@@ -11,9 +11,9 @@ from pydantic import Field
 
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.session import (
+    history_entry,
     left_behind,
     process_group,
-    provenance,
     RunSettings,
     training_session,
     use_threads,
@@ -27,11 +27,14 @@ _DESCRIPTION = """Meta-post-train a pre-trained policy (Algorithm 1).
 
 Example: metagcttt meta-train --preset pointmaze-medium-navigate-cpu --meta.algorithm fomaml
 Writes OUT/checkpoint, OUT/metrics.jsonl and TensorBoard logs.
-Ctrl-C saves and ends; --resume goes on."""
+Ctrl-C saves and ends; --resume, with no other flag than --out, continues."""
 
 
 class MetaTrainSettings(RunSettings):
-    """Settings of the tool."""
+    """Settings of the program."""
+
+    may_change = RunSettings.may_change | {'checkpoint', 'cuda_graphs'}
+    may_grow = frozenset({'meta.outer_steps'})
 
     checkpoint: Path = Field(Path('out/pretrain/checkpoint'), description='pre-trained policy')
     out: Path = Field(Path('out/meta'), description='folder of the run')
@@ -72,12 +75,11 @@ def _run(settings: MetaTrainSettings) -> None:
     changes = settings.model_dump(include={'actor_loss'}, exclude_none=True)
     base = load_checkpoint(settings.checkpoint, changes=changes).to(settings.device)
     dataset = TrajectoryDataset.load(settings.dataset)
-    decisive = settings.model_dump(mode='json', include={'meta', 'seed', 'threads'})
-    decisive |= settings.model_dump(include={'device', 'actor_loss'}, exclude_defaults=True)
-    decisive['dataset'] = settings.dataset.name
+    decisive = settings.decisive()
+    decisive |= {'dataset': dataset.fingerprint, 'checkpoint': base.fingerprint()}
     base.metadata['history'] = [
         *base.metadata.get('history', []),
-        {'stage': 'post_train', **decisive, **provenance()},
+        history_entry('post_train', settings, decisive),
     ]
     steps = settings.meta.outer_steps
     with training_session(settings, 'post_train', decisive, steps) as session:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Self, TYPE_CHECKING
+from typing import Annotated, Any, get_args, Self, TYPE_CHECKING
 
 from metagcttt_core import DatasetError, TrajectoryDataset
 from metagcttt_core.agents import AgentName
@@ -14,7 +14,12 @@ from pydantic import Field, model_validator
 import tyro
 
 from metagcttt_tools.common.cli import fail, parse
-from metagcttt_tools.common.session import provenance, RunSettings, training_session, use_threads
+from metagcttt_tools.common.session import (
+    history_entry,
+    RunSettings,
+    training_session,
+    use_threads,
+)
 
 if TYPE_CHECKING:
     from metagcttt_core import Agent
@@ -24,11 +29,14 @@ _DESCRIPTION = """Pre-train a goal-conditioned policy on an offline dataset.
 
 Example: metagcttt pretrain --preset pointmaze-medium-navigate-cpu
 Writes OUT/checkpoint, OUT/metrics.jsonl and TensorBoard logs.
-Ctrl-C saves and ends; --resume goes on."""
+Ctrl-C saves and ends; --resume, with no other flag than --out, continues."""
 
 
 class PretrainSettings(RunSettings):
-    """Settings of the tool."""
+    """Settings of the program."""
+
+    may_change = RunSettings.may_change | {'evaluate_every', 'evaluation_episodes'}
+    may_grow = frozenset({'training.steps'})
 
     environment: str = Field('pointmaze-medium-v0', description='simulator the policy is for')
     out: Path = Field(Path('out/pretrain'), description='folder of the run')
@@ -52,6 +60,11 @@ class PretrainSettings(RunSettings):
         None, ge=1, description='steps between evaluations of the policy in its simulator'
     )
     evaluation_episodes: int = Field(10, ge=1, description='episodes per task of an evaluation')
+
+    def decisive(self) -> dict[str, Any]:
+        """The settings that decide the result, without those of other agents."""
+        others = tuple(f'{name}.' for name in get_args(AgentName) if name != self.agent)
+        return {n: v for n, v in super().decisive().items() if not n.startswith(others)}
 
     @property
     def agent_settings(self) -> dict[str, Any]:
@@ -100,17 +113,11 @@ def _run(settings: PretrainSettings) -> None:
         seed=settings.seed,
         **settings.agent_settings,
     ).to(settings.device)
-    decisive = settings.model_dump(
-        mode='json', include={'agent', 'hidden', 'training', 'seed', 'threads'}
-    )
-    decisive |= settings.model_dump(include={'device', 'compiled'}, exclude_defaults=True)
     precision = resolve_precision(settings.precision, agent)
-    if precision != 'float32':
-        decisive['precision'] = precision
-    decisive['dataset'] = settings.dataset.name
+    decisive = settings.decisive() | {'dataset': dataset.fingerprint, 'precision': precision}
     agent.metadata = {
         'environment': settings.environment,
-        'history': [{'stage': 'pretrain', **decisive, **provenance()}],
+        'history': [history_entry('pretrain', settings, decisive)],
     }
     held_out = validation_data(settings.dataset, dataset)
     validation = Validation(held_out, settings.training.batch_size, precision)

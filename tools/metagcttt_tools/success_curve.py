@@ -22,7 +22,8 @@ _DESCRIPTION = """Success over the steps of pre-training, by test-time training 
 
 Example: metagcttt success-curve --runs out/base-0 out/base-1 --budgets 0 50
 The runs are those of metagcttt pretrain with --snapshot-every, one for each training seed.
-Writes OUT as JSON and a picture beside it. Ctrl-C is safe: --resume goes on."""
+Writes OUT as JSON and a picture beside it. Ctrl-C is safe; --resume, with no other flag
+than --out, continues."""
 
 
 class SuccessCurveSettings(ProtocolSettings):
@@ -48,11 +49,11 @@ def main(argv: list[str] | None = None) -> None:
             checkpoints=tuple(snapshot(run, step) for run in settings.runs for step in steps),
             **settings.model_dump(exclude={'runs'}),
         )
-        results = evaluate(evaluation)
+        results = evaluate(evaluation, settings)
     except ValueError as error:
         fail(str(error))
     except KeyboardInterrupt:
-        print('interrupted; the same command with --resume goes on', file=sys.stderr)
+        print('interrupted; pass --resume to continue', file=sys.stderr)
         raise SystemExit(130) from None
     rows = curve_rows(results, steps)
     write_report(settings.out, settings, {'curve': rows})

@@ -3,7 +3,7 @@
 from metagcttt_tools.common.job_log import JobLog
 import pytest
 
-SETTINGS = {'episodes': 10, 'seeds': [0, 1]}
+SETTINGS = {'decisive': {'episodes': 10, 'seeds': [0, 1]}, 'program': {'processes': 2}}
 
 
 def test_finished_jobs_are_there_after_a_kill(tmp_path):
@@ -29,7 +29,7 @@ def test_other_settings_are_refused_by_name(tmp_path):
     path = tmp_path / 'jobs.jsonl'
     JobLog(path, SETTINGS, resume=False)
     with pytest.raises(ValueError, match='cannot resume, episodes was 10 and is now 50'):
-        JobLog(path, {**SETTINGS, 'episodes': 50}, resume=True)
+        JobLog(path, {'decisive': {'episodes': 50, 'seeds': [0, 1]}}, resume=True)
 
 
 def test_removed_when_the_results_are_kept_elsewhere(tmp_path):

@@ -103,7 +103,7 @@ def test_other_precision_is_not_resumed(data, tmp_path, capsys):
     train(data, tmp_path / 'run')
     with pytest.raises(SystemExit, match='2'):
         train(data, tmp_path / 'run', '--resume', '--precision', 'bfloat16')
-    assert "precision was None and is now 'bfloat16'" in capsys.readouterr().err
+    assert "precision was 'float32' and is now 'bfloat16'" in capsys.readouterr().err
 
 
 def test_settings_of_the_agent_reach_the_policy(data, tmp_path):

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ValidationError
 import tyro
 
 from metagcttt_tools.common.presets import load_preset, presets_with
+from metagcttt_tools.common.resume import continued, Resumable
 
 SettingsT = TypeVar('SettingsT', bound=Settings)
 
@@ -30,7 +31,7 @@ def parse(
     """The settings of one program, read from the command line.
 
     `--preset NAME_OR_PATH` loads the values under `section` of a preset first; flags override
-    them.
+    them. `--resume` takes the settings kept with the run in OUT instead.
 
     Args:
         model: The program's settings.
@@ -50,14 +51,20 @@ def parse(
     try:
         values = preset_values(preset.preset, section)
         description += _preset_help(section)
-        default = model.model_validate(values)
-        return tyro.cli(
-            model,
-            args=rest,
-            default=default,
-            description=description,
-            prog=f'metagcttt {program}',
-        )
+
+        def with_flags(default: SettingsT) -> SettingsT:
+            return tyro.cli(
+                model,
+                args=rest,
+                default=default,
+                description=description,
+                prog=f'metagcttt {program}',
+            )
+
+        settings = with_flags(model.model_validate(values))
+        if isinstance(settings, Resumable) and settings.resume:
+            return continued(settings, values, with_flags)  # type: ignore[arg-type]
+        return settings
     except ValidationError as error:
         fail(*error_lines(error))
     except ValueError as error:

@@ -15,7 +15,7 @@ class JobLog(Generic[Job]):
 
         Args:
             path: The file; its folder is made if missing.
-            settings: What decides the results.
+            settings: `decisive`, what decides the results, and whatever else to keep.
             resume: Keep what an earlier call for the same settings finished.
 
         Raises:
@@ -41,18 +41,24 @@ class JobLog(Generic[Job]):
         self._file.close()
         self._path.unlink()
 
+    @staticmethod
+    def settings(path: Path) -> dict[str, Any]:
+        """The settings that the log in `path` begins with."""
+        with path.open(encoding='utf-8') as file:
+            return json.loads(file.readline())['settings']
+
     def _write(self, *lines: dict[str, Any]) -> None:
         self._file.writelines(json.dumps(line) + '\n' for line in lines)
         self._file.flush()
 
     def _read(self, settings: dict[str, Any]) -> None:
-        header, *lines = self._path.read_text(encoding='utf-8').splitlines(keepends=True)
-        kept = json.loads(header)['settings']
-        for name in sorted(kept.keys() | settings.keys()):
-            if kept.get(name) != settings.get(name):
+        _, *lines = self._path.read_text(encoding='utf-8').splitlines(keepends=True)
+        kept, asked = self.settings(self._path)['decisive'], settings['decisive']
+        for name in sorted(kept.keys() | asked.keys()):
+            if kept.get(name) != asked.get(name):
                 raise ValueError(
                     f'{self._path}: cannot resume, {name} was {kept.get(name)!r} '
-                    f'and is now {settings.get(name)!r}'
+                    f'and is now {asked.get(name)!r}'
                 )
         for line in lines:
             if line.endswith('\n'):  # a kill can leave the last line unfinished

@@ -1,4 +1,4 @@
-"""What the long-running tools share: logs, provenance, interruption."""
+"""A training run in progress: logs, checkpoints, interruption, provenance."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 import threading
-from typing import Any, TYPE_CHECKING
+from typing import Any, ClassVar, TYPE_CHECKING
 
 from metagcttt_core.config import Settings
 from metagcttt_core.files import write_json
@@ -20,6 +20,7 @@ from pydantic import Field, field_validator
 from tqdm import tqdm
 
 from metagcttt_tools.common.cli import fail
+from metagcttt_tools.common.resume import leaves, nested, Resumable
 from metagcttt_tools.common.run_log import RunLog, SilentLog
 
 if TYPE_CHECKING:
@@ -28,19 +29,23 @@ if TYPE_CHECKING:
 _PACKAGES = ('torch', 'numpy', 'mujoco', 'ogbench')
 
 
-class RunSettings(Settings):
-    """Settings that the training tools share."""
+class RunSettings(Resumable):
+    """Settings that the training programs share."""
+
+    # The data are known by their content, wherever they are.
+    may_change: ClassVar[frozenset[str]] = frozenset(
+        {'dataset', 'checkpoint_every', 'log_every', 'snapshot_every', 'device'}
+    )
 
     dataset: Path = Field(
         Path('data/pointmaze-medium-navigate-v0.npz'), description='offline dataset (npz)'
     )
     out: Path = Field(Path('out/run'), description='folder of the run')
-    seed: int = Field(0, ge=0, description='of everything random')
+    seed: int = Field(0, ge=0, description='random seed')
     checkpoint_every: int = Field(1000, ge=1, description='steps between checkpoints')
     log_every: int = Field(100, ge=1, description='steps between log lines')
     threads: int = Field(1, ge=1, description='threads for tensor operations')
     device: str = Field('cpu', description='where to compute: cpu, cuda or cuda:NUMBER')
-    resume: bool = Field(False, description='go on from the checkpoint in OUT, if there is one')
 
     @field_validator('device')
     @classmethod
@@ -95,15 +100,16 @@ def training_session(
             with status 2 when something cannot be written, the last checkpoint being left whole.
     """
     from metagcttt_core.meta.parallel import any_process, first_process
-    from metagcttt_core.training.checkpoint import has_checkpoint, load_training_state
+    from metagcttt_core.training.checkpoint import has_checkpoint, steps_done
     from metagcttt_core.training.run import TrainingInterrupted, TrainingRun
     import torch
 
     folder = settings.checkpoint_folder
-    exists = has_checkpoint(folder)
-    if exists and not settings.resume:
-        fail(f'{folder} holds a checkpoint: go on with --resume, or choose another --out')
-    first = load_training_state(folder).step if exists else 0
+    if has_checkpoint(folder) and not settings.resume:
+        fail(f'{folder} holds a checkpoint: pass --resume to continue, or choose another --out')
+    first = steps_done(folder)
+    if first > steps:
+        fail(f'{folder}: has {first} steps already, {steps} were asked for')
     writes = first_process()
     try:
         if writes:
@@ -125,7 +131,7 @@ def training_session(
             yield Session(run, log, bar)
     except TrainingInterrupted as interruption:
         if writes:
-            print(f'{interruption}; go on with --resume')
+            print(f'{interruption}; pass --resume to continue')
         raise SystemExit(130) from interruption
     except OSError as error:
         fail(f'{settings.out}: cannot be written ({error}); {left_behind(settings)}')
@@ -135,12 +141,10 @@ def training_session(
 
 def left_behind(settings: RunSettings) -> str:
     """What there is to go on from after a failure, in words."""
-    from metagcttt_core.training.checkpoint import has_checkpoint, load_training_state
+    from metagcttt_core.training.checkpoint import steps_done
 
-    if not has_checkpoint(settings.checkpoint_folder):
-        return 'there is no checkpoint yet'
-    step = load_training_state(settings.checkpoint_folder).step
-    return f'the checkpoint of step {step} is whole'
+    step = steps_done(settings.checkpoint_folder)
+    return f'the checkpoint of step {step} is whole' if step else 'there is no checkpoint yet'
 
 
 @contextmanager
@@ -176,6 +180,12 @@ def stop_on_signal() -> Iterator[threading.Event]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+def history_entry(stage: str, settings: RunSettings, decisive: dict[str, Any]) -> dict[str, Any]:
+    """The record of a run in the history of the policy that comes of it."""
+    steps = {name: leaves(settings)[name] for name in settings.may_grow}
+    return {'stage': stage, **nested(decisive | steps), **provenance()}
 
 
 def provenance() -> dict[str, Any]:
