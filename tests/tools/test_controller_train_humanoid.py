@@ -51,7 +51,7 @@ def test_finished_run_is_not_trained_over(
 def test_other_seed_is_another_run(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         train(trained, '--resume', '--seed', '5')
-    assert 'cannot resume, it is of other seed' in capsys.readouterr().err
+    assert 'cannot resume, seed was 0 and is now 5' in capsys.readouterr().err
 
 
 def test_controller_makes_data_that_end_before_a_fall(trained: Path, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from metagcttt_tools.loss_curves import (
 import numpy as np
 import pytest
 from tests.core.builders import assert_bit_equal, random_dataset, tiny_agent, weights_of
+from tests.tools.tables import squeezed
 
 
 @pytest.fixture
@@ -114,4 +115,4 @@ def test_command_adapts_to_a_task_with_each_rate(tmp_path, capsys):
     assert results['losses']['lr 0.001']['total'][0] == results['losses']['lr 0.01']['total'][0]
     assert results['losses']['lr 0.001']['total'][4] != results['losses']['lr 0.01']['total'][4]
     assert out.with_suffix('.png').read_bytes().startswith(b'\x89PNG')
-    assert '| line | total |' in capsys.readouterr().out
+    assert '| line | total |' in squeezed(capsys.readouterr().out)

@@ -3,8 +3,10 @@
 import json
 
 from metagcttt_tools import report
+from metagcttt_tools.common.manifest import Evaluation, Manifest, Policy
 from metagcttt_tools.report import format_report, read_study
 import pytest
+from tests.tools.tables import squeezed
 
 RATES = {
     'base-0': [0.2, 0.6, 0.8],
@@ -15,10 +17,20 @@ RATES = {
 }
 
 
-def results(rates, budgets, suffix='checkpoint'):
+def policies(runs, fraction=1.0):
+    """The policies of runs called ARM-SEED."""
+    found = []
+    for run in runs:
+        arm, seed = run.rsplit('-', 1)
+        share = 0 if arm == 'base' else fraction
+        found.append(Policy(checkpoint=f'out/{run}', arm=arm, seed=seed, fraction=share))
+    return found
+
+
+def results(rates, budgets):
     return [
         {
-            'checkpoint': f'out/study/{run}/{suffix}',
+            'checkpoint': f'out/{run}',
             'curve': [{'budget': b, 'success': s} for b, s in zip(budgets, row, strict=True)],
         }
         for run, row in rates.items()
@@ -27,17 +39,15 @@ def results(rates, budgets, suffix='checkpoint'):
 
 @pytest.fixture
 def study(tmp_path):
-    settings = {'base': 'some-preset', 'out': 'out/study', 'curve_budgets': [0, 20]}
-    settings |= {'adaptations': {'ttt': {}}, 'curve': [0.5], 'seeds': [0, 1]}
-    (tmp_path / 'study.json').write_text(json.dumps({'settings': settings}))
+    settings = {'base': 'some-preset', 'out': 'out/study'}
     evaluation = {'results': results(RATES, [0, 10, 20])}
     (tmp_path / 'evaluation-ttt.json').write_text(json.dumps(evaluation))
     half = {'reptile-0': [0.5, 0.7], 'reptile-1': [0.3, 0.9]}
-    curve = {'results': results(half, [0, 20], suffix='snapshots/000050')}
+    curve = {'results': results(half, [0, 20])}
     (tmp_path / 'curve.json').write_text(json.dumps(curve))
-    (tmp_path / 'reptile-0').mkdir()
-    run = {'settings': {'meta': {'outer_steps': 100}}}
-    (tmp_path / 'reptile-0' / 'settings.json').write_text(json.dumps(run))
+    trained = Evaluation(file='evaluation-ttt.json', policies=policies(RATES))
+    along = Evaluation(file='curve.json', policies=policies(half, fraction=0.5))
+    Manifest(settings=settings, adaptations={'ttt': trained}, curve=along).write(tmp_path)
     return tmp_path
 
 
@@ -73,7 +83,7 @@ def test_curve_goes_from_the_base_policy_to_the_post_trained_one(study):
 
 
 def test_tables_show_every_arm(study):
-    text = format_report(read_study(study))
+    text = squeezed(format_report(read_study(study)))
     assert '| base | 2 | 0.30 ± 0.07 | 0.70 ± 0.07 | 0.90 ± 0.07 | 0.650 ± 0.071 |' in text
     assert '| 0.550, 0.750 | 1x |' in text
     assert '| fomaml-k1 | 1 | 0.00 ± 0.00 | 0.80 ± 0.00 | 0.80 ± 0.00 |' in text
@@ -97,3 +107,20 @@ def test_unfinished_study_names_what_is_missing(study, capsys):
     error = capsys.readouterr().err
     assert 'evaluation-ttt.json does not exist' in error
     assert 'metagcttt sweep' in error
+
+
+@pytest.mark.parametrize(
+    ('content', 'message'),
+    [
+        (None, 'manifest.json does not exist: run metagcttt sweep first'),
+        ('{}', 'manifest.json: settings: Field required'),
+        ('{"format": "other"}', "format: Input should be 'metagcttt-study'"),
+        ('[1', 'manifest.json: Invalid JSON'),
+    ],
+)
+def test_folder_without_a_manifest_is_refused(tmp_path, content, message, capsys):
+    if content is not None:
+        (tmp_path / 'manifest.json').write_text(content)
+    with pytest.raises(SystemExit, match='2'):
+        report.main([str(tmp_path)])
+    assert message in capsys.readouterr().err

@@ -8,6 +8,7 @@ from metagcttt_tools.generate import GenerateSettings
 from metagcttt_tools.meta_train import MetaTrainSettings
 import pytest
 from sim_bridge.registry import environment_names
+from tests.tools.tables import squeezed
 
 # Section, algorithm, actor loss, inner LR, meta LR, inner steps, TTT LR, checkpoint, early stop.
 TABLE_3 = """
@@ -83,7 +84,7 @@ def test_pretraining_settings_are_the_paper_s():
 
 def test_tables_are_printed(capsys):
     presets.main([])
-    printed = capsys.readouterr().out
+    printed = squeezed(capsys.readouterr().out)
     assert (
         '| paper-antmaze-navigate-bc-reptile | bc | 0.0003 | 0.5 | 100 | 0.0003 | 5,000 | 50,000 '
         '| yes | episode |'

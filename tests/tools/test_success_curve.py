@@ -4,17 +4,19 @@ import json
 
 from metagcttt_core import save_checkpoint
 from metagcttt_tools import success_curve
-from metagcttt_tools.success_curve import common_steps, curve_picture, curve_rows, snapshot
+from metagcttt_tools.common.session import snapshot_folder
+from metagcttt_tools.success_curve import common_steps, curve_picture, curve_rows
 import numpy as np
 import pytest
 from tests.core.builders import random_dataset, tiny_agent
+from tests.tools.tables import squeezed
 
 
 def make_run(folder, steps):
     for step in steps:
         agent = tiny_agent(seed=step)
         agent.metadata = {'environment': 'pointmaze-medium-v0'}
-        save_checkpoint(agent, snapshot(folder, step))
+        save_checkpoint(agent, snapshot_folder(folder, step))
     return folder
 
 
@@ -88,4 +90,4 @@ def test_command_writes_results_and_picture(tmp_path, capsys):
     assert [(row['step'], row['budget']) for row in rows] == [(10, 0)]
     assert all(0 <= row['success'] <= 1 for row in rows)
     assert out.with_suffix('.png').read_bytes().startswith(b'\x89PNG')
-    assert '| step | budget | success | standard_error |' in capsys.readouterr().out
+    assert '| step | budget | success | standard_error |' in squeezed(capsys.readouterr().out)

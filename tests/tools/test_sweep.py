@@ -65,18 +65,18 @@ def study_of(preset, **different):
 def test_each_run_differs_only_where_the_study_says(preset):
     study = study_of(preset)
     assert [run.seed for run in study.pretraining] == [0, 1]
-    names = [run.out.name for run in study.post_training]
+    names = [run.out.name for _, run in study.post_training]
     assert names == ['reptile-0', 'reptile-1', 'one-step-1']
-    reptile, _, one_step = study.post_training
+    (_, reptile), _, (_, one_step) = study.post_training
     assert (reptile.meta.algorithm, reptile.meta.meta_lr) == ('reptile', 0.1)
     assert (reptile.meta.inner_steps, reptile.meta.early_stopping) == (2, True)
     assert (one_step.meta.inner_steps, one_step.meta.early_stopping) == (1, False)
     assert one_step.checkpoint == study.pretraining[1].checkpoint_folder
     assert reptile.snapshot_every == 2
-    full, slow = study.evaluations['full'], study.evaluations['slow']
+    full, slow = study.evaluations['full'][0], study.evaluations['slow'][0]
     assert slow.ttt == full.ttt.model_copy(update={'lr': 1e-5})
     assert [path.parent.name for path in full.checkpoints] == ['base-0', 'base-1', *names]
-    snapshots = study.evaluations['curve'].checkpoints
+    snapshots = study.curve[0].checkpoints
     assert [path.parts[-3:] for path in snapshots] == [
         ('reptile-0', 'snapshots', '000002'),
         ('reptile-1', 'snapshots', '000002'),
@@ -107,7 +107,7 @@ def test_a_run_that_fails_ends_the_study_with_its_message(preset, capsys):
 
 
 def test_an_evaluation_is_done_once_it_is_there_with_the_same_settings(preset):
-    evaluation = study_of(preset).evaluations['full']
+    evaluation, _ = study_of(preset).evaluations['full']
     assert not is_evaluated(evaluation)
     evaluation.out.parent.mkdir()
     elsewhere = evaluation.model_copy(update={'processes': 7})

@@ -13,6 +13,7 @@ from metagcttt_tools import evaluate, meta_train, pretrain
 import numpy as np
 import pytest
 from tests.core.builders import maze_walks
+from tests.tools.tables import squeezed
 import torch
 
 SMALL_AGENT = ['--hidden', '16', '16', '--training.batch-size', '32']
@@ -144,7 +145,7 @@ def test_evaluate_writes_success_by_budget_and_seed(dataset_path, base, tmp_path
         assert len(point['per_seed']) == 2
         assert sorted(point['per_task']) == ['1', '2', '3', '4', '5']
         assert point['success'] == pytest.approx(np.mean(point['per_seed']))
-    assert '| K = 0 | K = 1 | AUC |' in capsys.readouterr().out
+    assert '| K = 0 | K = 1 | AUC |' in squeezed(capsys.readouterr().out)
 
 
 @pytest.mark.mujoco
@@ -166,4 +167,4 @@ def test_evaluate_table_shows_mean_error_and_auc():
         {'budget': 10, 'success': 0.875, 'standard_error': 0.05},
     ]
     table = evaluate.format_table([{'checkpoint': 'meta', 'curve': curve, 'auc': 0.5625}])
-    assert table.splitlines()[-1] == '| meta | 0.25 ± 0.01 | 0.88 ± 0.05 | 0.562 |'
+    assert squeezed(table).splitlines()[-1] == '| meta | 0.25 ± 0.01 | 0.88 ± 0.05 | 0.562 |'

@@ -14,6 +14,7 @@ from pydantic import Field
 from sim_bridge import make_simulator
 
 from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.results import markdown_table
 from metagcttt_tools.common.session import provenance
 
 if TYPE_CHECKING:
@@ -134,17 +135,17 @@ def numbers(outcome: GoalOutcome) -> dict[str, Any]:
 
 def format_table(arms: dict[str, list[dict[str, Any]]]) -> str:
     """The arms side by side, as Markdown."""
-    lines = [
-        '| arm | goals reached | steps by task | adaptation ms (median) | transitions (median) |',
-        '|---|---|---|---|---|',
-    ]
-    for arm, goals in arms.items():
-        reached = sum(goal['success'] for goal in goals)
-        steps = ', '.join(str(g['steps']) if g['success'] else 'missed' for g in goals)
-        adaptation = np.median([goal['adaptation_ms'] for goal in goals])
-        transitions = np.median([goal['transitions'] for goal in goals])
-        lines.append(
-            f'| {arm} | {reached} of {len(goals)} | {steps} '
-            f'| {adaptation:.0f} | {transitions:.0f} |'
-        )
-    return '\n'.join(lines)
+    return markdown_table(
+        [
+            {
+                'arm': arm,
+                'goals reached': f'{sum(goal["success"] for goal in goals)} of {len(goals)}',
+                'steps by task': ', '.join(
+                    str(goal['steps']) if goal['success'] else 'missed' for goal in goals
+                ),
+                'adaptation ms (median)': round(np.median([g['adaptation_ms'] for g in goals])),
+                'transitions (median)': round(np.median([g['transitions'] for g in goals])),
+            }
+            for arm, goals in arms.items()
+        ]
+    )

@@ -25,6 +25,7 @@ from tqdm import tqdm
 
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.job_log import JobLog
+from metagcttt_tools.common.results import markdown_table
 from metagcttt_tools.common.resume import Resumable
 from metagcttt_tools.common.session import provenance, use_threads
 
@@ -150,16 +151,20 @@ def success_curve(checkpoint: Path, curve: list[dict[str, Any]]) -> dict[str, An
 
 def format_table(results: list[dict[str, Any]]) -> str:
     """Success by budget as a Markdown table."""
-    budgets = [point['budget'] for point in results[0]['curve']]
-    lines = [
-        '| policy | ' + ' | '.join(f'K = {budget}' for budget in budgets) + ' | AUC |',
-        '|---' * (len(budgets) + 2) + '|',
-    ]
-    for result in results:
-        cells = [f'{p["success"]:.2f} ± {p["standard_error"]:.2f}' for p in result['curve']]
-        auc = '' if result['auc'] is None else f'{result["auc"]:.3f}'
-        lines.append(f'| {result["checkpoint"]} | ' + ' | '.join(cells) + f' | {auc} |')
-    return '\n'.join(lines)
+    return markdown_table(
+        [
+            {
+                'policy': result['checkpoint'],
+                **{
+                    f'K = {point["budget"]}': f'{point["success"]:.2f} ± '
+                    f'{point["standard_error"]:.2f}'
+                    for point in result['curve']
+                },
+                'AUC': '' if result['auc'] is None else f'{result["auc"]:.3f}',
+            }
+            for result in results
+        ]
+    )
 
 
 def finished_jobs(out: Path) -> Path:

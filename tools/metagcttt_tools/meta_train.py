@@ -15,6 +15,7 @@ from metagcttt_tools.common.session import (
     left_behind,
     process_group,
     RunSettings,
+    snapshot_folder,
     training_session,
     use_threads,
 )
@@ -90,7 +91,7 @@ def _run(settings: MetaTrainSettings) -> None:
             session.bar.update()
             diagnostics.add(outer)
             if settings.snapshot_every and outer.step % settings.snapshot_every == 0:
-                save_checkpoint(agent, settings.out / 'snapshots' / f'{outer.step:06d}')
+                save_checkpoint(agent, snapshot_folder(settings.out, outer.step))
             if outer.step % settings.log_every == 0:
                 record = diagnostics.record(agent)
                 warnings = watch.add(record.means)

@@ -17,6 +17,7 @@ from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.session import (
     history_entry,
     RunSettings,
+    snapshot_folder,
     training_session,
     use_threads,
 )
@@ -91,13 +92,12 @@ def main(argv: list[str] | None = None) -> None:
 
 
 def _run(settings: PretrainSettings) -> None:
-    from metagcttt_core import make_agent
+    from metagcttt_core import make_agent, save_checkpoint
     from metagcttt_core.training.numerics import resolve_precision
     from metagcttt_core.training.pretrain import pretrain
 
     from metagcttt_tools.common.pretraining_metrics import (
         as_scalars,
-        keep_snapshot,
         success_rates,
         Throughput,
         Validation,
@@ -138,7 +138,7 @@ def _run(settings: PretrainSettings) -> None:
                     agent, settings.environment, settings.evaluation_episodes, settings.seed
                 )
             if due(settings.snapshot_every):
-                keep_snapshot(agent, settings.out, step)
+                save_checkpoint(agent, snapshot_folder(settings.out, step))
             if scalars:
                 session.log.write(step, scalars)
                 throughput.restart()

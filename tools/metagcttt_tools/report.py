@@ -14,13 +14,16 @@ from pydantic import Field
 import tyro
 
 from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.manifest import BASE, Evaluation, Manifest
+from metagcttt_tools.common.results import markdown_table
 
 _DESCRIPTION = """Tables and figures of a study that metagcttt sweep ran.
 
 Example: metagcttt report out/study --out docs/results/study
 Prints the tables; writes OUT.json, OUT.md, OUT.png and, with a curve, OUT-curve.png."""
 
-BASE = 'base'
+Rates = dict[tuple[str, float], dict[int, dict[int, float]]]
+"""Success by arm and fraction of the outer steps, then by training seed, then by budget."""
 
 
 class ReportSettings(Settings):
@@ -84,32 +87,29 @@ def read_study(folder: Path, threshold: float = 0.8) -> dict[str, Any]:
     Raises:
         ValueError: If the folder holds no finished study; names the file that is missing.
     """
-    study = _read_json(folder / 'study.json')
-    settings = study['settings']
+    manifest = Manifest.read(folder)
     adaptations = {}
-    for name in settings['adaptations']:
-        rates = _rates(_read_json(folder / f'evaluation-{name}.json')['results'])
+    for name, evaluation in manifest.adaptations.items():
+        rates = _rates(folder, evaluation)
         arms = {arm: _summary(seeds) for (arm, _), seeds in rates.items()}
         for arm in arms.values():
-            base = _summary({seed: rates[BASE, 0][seed] for seed in arm['seeds']})
+            base = _summary({seed: rates[BASE, 0.0][seed] for seed in arm['seeds']})
             efficiency = adaptation_efficiency(_by_budget(base), _by_budget(arm), threshold)
             arm['efficiency'] = _finite(efficiency)
         adaptations[name] = arms
     curve: dict[str, dict[float, Any]] = {}
-    if (folder / 'curve.json').is_file():
-        curve = _curve(folder, settings, next(iter(adaptations.values())))
+    if manifest.curve is not None:
+        curve = _curve(_rates(folder, manifest.curve), next(iter(adaptations.values())))
+    study = manifest.model_dump(mode='json', include={'settings', 'commit', 'versions'})
     return {'study': study, 'threshold': threshold, 'adaptations': adaptations, 'curve': curve}
 
 
-def _curve(folder: Path, settings: dict[str, Any], final: dict[str, Any]) -> dict[str, Any]:
-    rates = _rates(_read_json(folder / 'curve.json')['results'])
-    budgets = settings['curve_budgets']
-    base = _restrict(final[BASE], budgets)
+def _curve(rates: Rates, final: dict[str, Any]) -> dict[str, Any]:
+    """Success by arm and fraction of the outer steps, from the base policy to the last."""
+    budgets = list(next(iter(next(iter(rates.values())).values())))
     curve: dict[str, dict[float, Any]] = {}
-    for (arm, step), seeds in rates.items():
-        run = _read_json(folder / f'{arm}-{min(seeds)}' / 'settings.json')
-        fraction = step / run['settings']['meta']['outer_steps']
-        curve.setdefault(arm, {0.0: base})[fraction] = _summary(seeds)
+    for (arm, fraction), seeds in rates.items():
+        curve.setdefault(arm, {0.0: _restrict(final[BASE], budgets)})[fraction] = _summary(seeds)
     for arm, points in curve.items():
         points[1.0] = _restrict(final[arm], budgets)
     return curve
@@ -123,17 +123,13 @@ def _restrict(summary: dict[str, Any], budgets: list[int]) -> dict[str, Any]:
     }
 
 
-def _rates(results: list[dict[str, Any]]) -> dict[tuple[str, int], dict[int, dict[int, float]]]:
-    """Success by (arm, outer step; 0 for the last), training seed and budget."""
-    rates: dict[tuple[str, int], dict[int, dict[int, float]]] = {}
-    for result in results:
-        path = Path(result['checkpoint'])
-        snapshot = path.parent.name == 'snapshots'
-        run = path.parent.parent.name if snapshot else path.parent.name
-        arm, seed = run.rsplit('-', 1)
-        step = int(path.name) if snapshot else 0
+def _rates(folder: Path, evaluation: Evaluation) -> Rates:
+    """The success rates in the file of an evaluation."""
+    rates: Rates = {}
+    results = _read_json(folder / evaluation.file)['results']
+    for policy, result in zip(evaluation.policies, results, strict=True):
         points = {point['budget']: point['success'] for point in result['curve']}
-        rates.setdefault((arm, step), {})[int(seed)] = points
+        rates.setdefault((policy.arm, policy.fraction), {})[policy.seed] = points
     return rates
 
 
@@ -186,49 +182,40 @@ def format_report(report: dict[str, Any]) -> str:
 
 
 def _success_table(arms: dict[str, Any]) -> str:
-    budgets = next(iter(arms.values()))['budgets']
-    header = [
-        'policy',
-        'seeds',
-        *(f'K = {budget}' for budget in budgets),
-        'AUC',
-        'AUC by seed',
-        'efficiency',
-    ]
     rows = []
     for name, arm in arms.items():
         efficiency = arm['efficiency'] or '-'
         if isinstance(efficiency, float):
             efficiency = f'{efficiency:g}x'
-        auc = '' if arm['auc'] is None else f'{arm["auc"]:.3f} ± {arm["auc_error"]:.3f}'
-        aucs = ', '.join(f'{value:.3f}' for value in arm['auc_per_seed'])
-        rows.append([name, str(len(arm['seeds'])), *_cells(arm), auc, aucs, efficiency])
-    return _table(header, rows)
+        rows.append(
+            {
+                'policy': name,
+                'seeds': len(arm['seeds']),
+                **_cells(arm),
+                'AUC': '' if arm['auc'] is None else f'{arm["auc"]:.3f} ± {arm["auc_error"]:.3f}',
+                'AUC by seed': ', '.join(f'{value:.3f}' for value in arm['auc_per_seed']),
+                'efficiency': efficiency,
+            }
+        )
+    return markdown_table(rows)
 
 
 def _curve_table(curve: dict[str, Any]) -> str:
-    first = next(iter(curve.values()))
-    budgets = first[next(iter(first))]['budgets']
-    header = ['policy', 'outer steps', *(f'K = {budget}' for budget in budgets)]
-    rows = [
-        [arm, f'{fraction:.0%}', *_cells(point)]
-        for arm, points in curve.items()
-        for fraction, point in points.items()
-    ]
-    return _table(header, rows)
+    return markdown_table(
+        [
+            {'policy': arm, 'outer steps': f'{fraction:.0%}', **_cells(point)}
+            for arm, points in curve.items()
+            for fraction, point in points.items()
+        ]
+    )
 
 
-def _cells(summary: dict[str, Any]) -> list[str]:
-    pairs = zip(summary['success'], summary['standard_error'], strict=True)
-    return [f'{mean:.2f} ± {error:.2f}' for mean, error in pairs]
-
-
-def _table(header: list[str], rows: list[list[str]]) -> str:
-    lines = [header, ['---'] * len(header), *rows]
-    return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
+def _cells(summary: dict[str, Any]) -> dict[str, str]:
+    rates = zip(summary['budgets'], summary['success'], summary['standard_error'], strict=True)
+    return {f'K = {budget}': f'{mean:.2f} ± {error:.2f}' for budget, mean, error in rates}
 
 
 def _read_json(path: Path) -> Any:
     if not path.is_file():
-        raise ValueError(f'{path} does not exist: run `metagcttt sweep` to its end first')
+        raise ValueError(f'{path} does not exist: run metagcttt sweep to its end first')
     return json.loads(path.read_text(encoding='utf-8'))

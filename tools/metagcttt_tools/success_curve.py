@@ -13,6 +13,7 @@ from pydantic import Field
 
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.results import markdown_table, write_report
+from metagcttt_tools.common.session import snapshot_folder, SNAPSHOTS
 from metagcttt_tools.evaluate import evaluate, EvaluateSettings, ProtocolSettings
 
 if TYPE_CHECKING:
@@ -46,7 +47,9 @@ def main(argv: list[str] | None = None) -> None:
     try:
         steps = common_steps(settings.runs)
         evaluation = EvaluateSettings(
-            checkpoints=tuple(snapshot(run, step) for run in settings.runs for step in steps),
+            checkpoints=tuple(
+                snapshot_folder(run, step) for run in settings.runs for step in steps
+            ),
             **settings.model_dump(exclude={'runs'}),
         )
         results = evaluate(evaluation, settings)
@@ -63,13 +66,6 @@ def main(argv: list[str] | None = None) -> None:
     print(f'results: {settings.out}\npicture: {picture}')
 
 
-def snapshot(run: Path, step: int) -> Path:
-    """Where a run keeps the policy that it had after so many steps."""
-    from metagcttt_tools.common.pretraining_metrics import SNAPSHOTS
-
-    return run / SNAPSHOTS / f'{step:06d}'
-
-
 def common_steps(runs: Sequence[Path]) -> list[int]:
     """The steps of the snapshots, ascending; the same in all runs.
 
@@ -77,8 +73,6 @@ def common_steps(runs: Sequence[Path]) -> list[int]:
         ValueError: If a run has none, or others than the first.
     """
     from metagcttt_core.training.checkpoint import has_checkpoint
-
-    from metagcttt_tools.common.pretraining_metrics import SNAPSHOTS
 
     found = []
     for run in runs:

@@ -12,14 +12,19 @@ from typing import Annotated, Any
 
 from metagcttt_core import MetaConfig, TTTConfig
 from metagcttt_core.config import Settings
-from metagcttt_core.files import write_json
 from pydantic import Field, model_validator
 from tqdm import tqdm
 import tyro
 import yaml
 
 from metagcttt_tools.common.cli import fail, parse, preset_values
-from metagcttt_tools.common.session import provenance, stop_on_signal
+from metagcttt_tools.common.manifest import BASE, checkpoints, Evaluation, Manifest, Policy
+from metagcttt_tools.common.session import (
+    provenance,
+    RunSettings,
+    snapshot_folder,
+    stop_on_signal,
+)
 from metagcttt_tools.evaluate import EvaluateSettings
 from metagcttt_tools.meta_train import MetaTrainSettings
 from metagcttt_tools.pretrain import PretrainSettings
@@ -83,7 +88,7 @@ def main(argv: list[str] | None = None) -> None:
     except ValueError as error:
         fail(str(error))
     except KeyboardInterrupt:
-        print('interrupted; the same command goes on', file=sys.stderr)
+        print('interrupted; run the same command to continue', file=sys.stderr)
         raise SystemExit(130) from None
     print(f'study: {settings.out}; metagcttt report {settings.out}')
 
@@ -100,36 +105,61 @@ class Study:
         self.settings = settings
         self.pretraining = [self._pretrain(seed) for seed in settings.seeds]
         self.post_training = [
-            self._post_train(name, arm, seed)
+            (name, self._post_train(name, arm, seed))
             for name, arm in settings.arms.items()
             for seed in arm.seeds or settings.seeds
         ]
-        runs = [*self.pretraining, *self.post_training]
+        trained = [
+            *(self._policy(BASE, run, 0.0) for run in self.pretraining),
+            *(self._policy(arm, run, 1.0) for arm, run in self.post_training),
+        ]
         self.evaluations = {
-            name: self._evaluation(
-                f'evaluation-{name}',
-                [run.checkpoint_folder for run in runs],
-                ttt=different,
-            )
+            name: self._evaluation(f'evaluation-{name}', trained, ttt=different)
             for name, different in settings.adaptations.items()
         }
-        if snapshots := self._snapshots():
-            self.evaluations['curve'] = self._evaluation(
-                'curve', snapshots, budgets=settings.curve_budgets
-            )
+        along = [
+            self._policy(arm, run, fraction)
+            for arm, run in self.post_training
+            if settings.arms[arm].seeds is None
+            for fraction in settings.curve
+        ]
+        self.curve = None
+        if along:
+            self.curve = self._evaluation('curve', along, budgets=settings.curve_budgets)
 
     def run(self) -> None:
         """Run whatever is not done yet."""
         out = self.settings.out
         out.mkdir(parents=True, exist_ok=True)
-        record = {'settings': self.settings.model_dump(mode='json'), **provenance()}
-        write_json(out / 'study.json', record)
-        pending = [run for run in self.evaluations.values() if not is_evaluated(run)]
+        self.manifest().write(out)
+        planned = [*self.evaluations.values(), *([self.curve] if self.curve else [])]
+        pending = [run for run, _ in planned if not is_evaluated(run)]
         with stop_on_signal() as stop:
             processes = self.settings.processes
             _run_all('pretrain', self.pretraining, processes, stop)
-            _run_all('meta_train', self.post_training, processes, stop)
+            _run_all('meta_train', [run for _, run in self.post_training], processes, stop)
             _run_all('evaluate', pending, 1, stop)
+
+    def manifest(self) -> Manifest:
+        """The policies of the study and the files of their results."""
+
+        def listed(planned: tuple[EvaluateSettings, Sequence[Policy]]) -> Evaluation:
+            run, policies = planned
+            return Evaluation(file=run.out.name, policies=tuple(policies))
+
+        return Manifest(
+            settings=self.settings.model_dump(mode='json'),
+            **provenance(),
+            adaptations={name: listed(planned) for name, planned in self.evaluations.items()},
+            curve=listed(self.curve) if self.curve else None,
+        )
+
+    def _policy(self, arm: str, run: RunSettings, fraction: float) -> Policy:
+        """A policy that a run leaves: its last, or one it keeps on the way."""
+        folder = run.checkpoint_folder
+        if isinstance(run, MetaTrainSettings) and fraction < 1:
+            folder = snapshot_folder(run.out, round(run.meta.outer_steps * fraction))
+        return Policy(checkpoint=folder, arm=arm, seed=run.seed, fraction=fraction)
 
     def _pretrain(self, seed: int) -> PretrainSettings:
         values = preset_values(self.settings.base, 'pretrain')
@@ -151,25 +181,15 @@ class Study:
     def _evaluation(
         self,
         name: str,
-        checkpoints: Sequence[Path],
+        policies: Sequence[Policy],
         ttt: dict[str, Any] | None = None,
         **different: Any,
-    ) -> EvaluateSettings:
+    ) -> tuple[EvaluateSettings, Sequence[Policy]]:
         values = preset_values(self.settings.base, 'evaluate')
         values |= {'ttt': TTTConfig.model_validate(values.get('ttt', {}) | (ttt or {}))}
-        values |= {'checkpoints': tuple(checkpoints), 'processes': self.settings.processes}
+        values |= {'checkpoints': checkpoints(policies), 'processes': self.settings.processes}
         values |= {'out': self.settings.out / f'{name}.json', 'resume': True, **different}
-        return EvaluateSettings.model_validate(values)
-
-    def _snapshots(self) -> list[Path]:
-        """Policies along the outer steps of the arms that run for every seed of the study."""
-        return [
-            run.out / 'snapshots' / f'{round(run.meta.outer_steps * fraction):06d}'
-            for name, arm in self.settings.arms.items()
-            if arm.seeds is None
-            for run in (self._post_train(name, arm, seed) for seed in self.settings.seeds)
-            for fraction in self.settings.curve
-        ]
+        return EvaluateSettings.model_validate(values), policies
 
 
 def _run_all(tool: str, runs: Sequence[Any], processes: int, stop: threading.Event) -> None:

@@ -6,6 +6,7 @@ from metagcttt_tools.benchmarks.scan import scan
 from metagcttt_tools.common.results import markdown_table
 import numpy as np
 import pytest
+from tests.tools.tables import squeezed
 
 
 @pytest.fixture(scope='module')
@@ -48,6 +49,8 @@ def test_values_in_batches_equal_all_at_once(dataset):
 
 
 def test_table_aligns_names_and_values():
-    table = markdown_table([{'dataset': 'a', 'rows': 1001000, 'ms': 0.98765, 'scan': 12345.6}])
+    table = squeezed(
+        markdown_table([{'dataset': 'a', 'rows': 1001000, 'ms': 0.98765, 'scan': 12345.6}])
+    )
     assert table.splitlines()[0] == '| dataset | rows | ms | scan |'
     assert table.splitlines()[2] == '| a | 1,001,000 | 0.988 | 12,346 |'

@@ -5,6 +5,7 @@ from metagcttt_tools.benchmarks.state_source import Answers
 from metagcttt_tools.main import main
 import numpy as np
 import pytest
+from tests.tools.tables import squeezed
 
 pytestmark = pytest.mark.ros
 
@@ -40,7 +41,7 @@ def test_benchmark_measures_a_policy_process(tmp_path: Path, capsys) -> None:
         # In hold there is no action before the expert's.
         assert cost['hold: first action'] == cost['hold: first adapted']
     assert report['settings']['hidden'] == [16, 16]
-    printed = capsys.readouterr().out
+    printed = squeezed(capsys.readouterr().out)
     assert '| adapting |' in printed
     assert '| K |' in printed
 
@@ -60,4 +61,4 @@ def test_benchmark_restarts_and_ends_every_node(tmp_path: Path, capsys) -> None:
     for row in rows:
         assert 0 < row['restart (s)'] == row['longest']
         assert 0 < row['end (s)'] == row['longest end']
-    assert '| policy_node |' in capsys.readouterr().out
+    assert '| policy_node |' in squeezed(capsys.readouterr().out)

@@ -13,6 +13,7 @@ from metagcttt_tools.benchmarks.training import (
 )
 import pytest
 from tests.core.builders import assert_changed, weights_of
+from tests.tools.tables import squeezed
 
 
 def shapes_of(name, batch_size, **settings):
@@ -70,5 +71,5 @@ def test_report_holds_every_agent_size_and_precision(tmp_path, capsys):
     assert {row['hidden'] for row in rows} == {'8 x 2', '4 x 2'}
     for row in rows:
         assert row['update / products'] == row['update'] / row['products']
-    table = capsys.readouterr().out
+    table = squeezed(capsys.readouterr().out)
     assert '| gciql ddpgbc | 8 x 2 | 16 | 1 | bfloat16 |' in table

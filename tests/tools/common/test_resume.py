@@ -58,7 +58,7 @@ def test_post_training_continues_by_its_folder_alone(data, tmp_path):
             '--meta.outer-steps',
             steps,
         ]
-        given += ['--meta.inner-steps', 2, '--meta.batch-size', 8]
+        given += ['--meta.outer-steps', steps, '--meta.inner-steps', 2, '--meta.batch-size', 8]
         meta_train.main([*map(str, given)])
     meta_train.main(['--out', str(extended), '--meta.outer-steps', '5', '--resume'])
     assert_bit_equal(

@@ -7,7 +7,6 @@ from metagcttt_core import (
     Agent,
     DatasetError,
     evaluate_success,
-    save_checkpoint,
     TrajectoryDataset,
 )
 from metagcttt_core.data import GoalRelabeller
@@ -16,8 +15,6 @@ from metagcttt_core.training.numerics import loss_function
 import numpy as np
 from sim_bridge import make_simulator
 from torch import no_grad, Tensor
-
-SNAPSHOTS = 'snapshots'
 
 
 class Validation:
@@ -88,11 +85,6 @@ def success_rates(agent: Agent, environment: str, episodes: int, seed: int) -> d
     simulator.close()
     rates = {f'evaluation/task{task}': rate for task, rate in results['tasks'].items()}
     return {'evaluation/success': results['mean'], **rates}
-
-
-def keep_snapshot(agent: Agent, folder: Path, step: int) -> None:
-    """Save the policy to `folder`/snapshots under the number of steps."""
-    save_checkpoint(agent, folder / SNAPSHOTS / f'{step:06d}')
 
 
 def as_scalars(losses: dict[str, Tensor]) -> dict[str, float]:

@@ -22,15 +22,15 @@ class Benchmark(Settings, ABC):
 
 def markdown_table(rows: list[dict[str, Any]]) -> str:
     """Rows of equal keys as a Markdown table; numbers with three significant digits."""
+    from tabulate import tabulate
 
     def cell(value: Any) -> str:
         if isinstance(value, float):
             return f'{value:.3g}' if abs(value) < 1000 else f'{value:,.0f}'
         return f'{value:,}' if isinstance(value, int) else str(value)
 
-    lines = ['| ' + ' | '.join(rows[0]) + ' |', '|---' * len(rows[0]) + '|']
-    lines += ['| ' + ' | '.join(cell(value) for value in row.values()) + ' |' for row in rows]
-    return '\n'.join(lines)
+    cells = [{name: cell(value) for name, value in row.items()} for row in rows]
+    return tabulate(cells, headers='keys', tablefmt='github', disable_numparse=True)
 
 
 def write_report(path: Path, settings: Settings, results: dict[str, Any]) -> None:

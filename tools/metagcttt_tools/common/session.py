@@ -26,6 +26,7 @@ from metagcttt_tools.common.run_log import RunLog, SilentLog
 if TYPE_CHECKING:
     from metagcttt_core.training.run import TrainingRun
 
+SNAPSHOTS = 'snapshots'
 _PACKAGES = ('torch', 'numpy', 'mujoco', 'ogbench')
 
 
@@ -137,6 +138,11 @@ def training_session(
         fail(f'{settings.out}: cannot be written ({error}); {left_behind(settings)}')
     if writes:
         print(f'policy: {folder}')
+
+
+def snapshot_folder(run: Path, step: int) -> Path:
+    """Where the run in a folder keeps the policy that it had after so many steps."""
+    return run / SNAPSHOTS / f'{step:06d}'
 
 
 def left_behind(settings: RunSettings) -> str:
