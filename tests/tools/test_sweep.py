@@ -9,6 +9,7 @@ import sys
 import time
 
 from metagcttt_tools import sweep
+from metagcttt_tools.common.manifest import Manifest
 from metagcttt_tools.common.presets import load_preset, preset_names
 from metagcttt_tools.sweep import is_evaluated, Study, SweepSettings
 import pytest
@@ -80,6 +81,25 @@ def test_each_run_differs_only_where_the_study_says(preset):
     assert [path.parts[-3:] for path in snapshots] == [
         ('reptile-0', 'snapshots', '000002'),
         ('reptile-1', 'snapshots', '000002'),
+    ]
+
+
+def test_manifest_names_every_policy_and_its_results(preset, tmp_path):
+    study = study_of(preset)
+    study.manifest().write(tmp_path)
+    manifest = Manifest.read(tmp_path)
+    found = [(p.arm, p.seed, p.fraction) for p in manifest.adaptations['full'].policies]
+    assert found == [
+        *(('base', 0, 0), ('base', 1, 0)),
+        *(('reptile', 0, 1), ('reptile', 1, 1), ('one-step', 1, 1)),
+    ]
+    assert [p.checkpoint for p in manifest.adaptations['full'].policies] == list(
+        study.evaluations['full'][0].checkpoints
+    )
+    assert manifest.adaptations['slow'].file == 'evaluation-slow.json'
+    assert [(p.arm, p.seed, p.fraction) for p in manifest.curve.policies] == [
+        ('reptile', 0, 0.5),
+        ('reptile', 1, 0.5),
     ]
 
 
