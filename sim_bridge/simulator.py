@@ -75,14 +75,12 @@ class StepResult:
         terminated: The task's goal is reached; the episode is over.
         truncated: The step limit of the task episode is reached; the episode is over.
         success: The position is within the tolerance of the current goal.
-        clipped: The action was outside [-1, 1] and was clipped.
     """
 
     observation: Array
     terminated: bool
     truncated: bool
     success: bool
-    clipped: bool = False
 
 
 class Simulator(ABC):

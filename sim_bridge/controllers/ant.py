@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_bridge.controllers.learned import LearnedFollower
 from sim_bridge.simulator import Array
@@ -31,35 +30,54 @@ class AntFollower(LearnedFollower):
 
 def turn_inputs(inputs: Array, turns: int) -> Array:
     """Own state and direction, shape (29,), after quarter turns of the world, clockwise."""
-    return inputs[_INPUT_SOURCES[turns % 4]] * _INPUT_SIGNS[turns % 4]
+    return _INPUT_TURNS[turns % 4] @ inputs
 
 
 def turn_action(action: Array, turns: int) -> Array:
     """The action, shape (8,), that does the same after quarter turns of the world, clockwise."""
-    return action[_ACTION_SOURCES[turns % 4]] * _ACTION_SIGNS[turns % 4]
+    return _ACTION_TURNS[turns % 4] @ action
 
 
-# What each number becomes in a quarter turn: plus or minus the number in which place, from 1.
-_INPUTS = (
-    *(1, 2, 4, -3, 5),  # height; quaternion w, x, y, z
-    *(8, -9, 10, 11, 12, -13, 6, 7),  # hip and ankle of the legs 1 to 4
-    *(15, -14, 16),  # velocity in the world
-    *(18, -17, 19),  # angular velocity in the torso
-    *(22, -23, 24, 25, 26, -27, 20, 21),  # velocities of the joints
-    *(29, -28),  # direction
+def _block_diagonal(*blocks: Array) -> Array:
+    """A square matrix with the blocks along its diagonal, and zeros."""
+    size = sum(len(block) for block in blocks)
+    matrix, start = np.zeros((size, size)), 0
+    for block in blocks:
+        stop = start + len(block)
+        matrix[start:stop, start:stop] = block
+        start = stop
+    return matrix
+
+
+def _legs_renamed(order: tuple[int, ...]) -> Array:
+    """Hip and ankle of the legs in `order`: each leg becomes the next one.
+
+    The ankles of the legs 1 and 4 bend the other way round than those of 2 and 3.
+    """
+    bend = {1: 1, 2: -1, 3: -1, 4: 1}
+    matrix = np.zeros((8, 8))
+    for place, leg in enumerate(order):
+        following = leg % 4 + 1
+        source = order.index(following)
+        matrix[2 * place, 2 * source] = 1
+        matrix[2 * place + 1, 2 * source + 1] = bend[leg] * bend[following]
+    return matrix
+
+
+_UNCHANGED = np.eye(1)
+_PLANAR = np.array([[0.0, 1.0], [-1.0, 0.0]])
+_VECTOR = _block_diagonal(_PLANAR, _UNCHANGED)
+_JOINTS = _legs_renamed((1, 2, 3, 4))
+_INPUT_TURN = _block_diagonal(
+    _UNCHANGED,  # height
+    *(_UNCHANGED, _VECTOR),  # quaternion: w; x, y, z
+    _JOINTS,  # angles
+    *(_VECTOR, _VECTOR),  # velocity in the world, angular velocity in the torso
+    _JOINTS,  # their velocities
+    _PLANAR,  # direction
 )
-_ACTION = (3, 4, 5, -6, 7, 8, 1, -2)  # hip and ankle of the legs 4, 1, 2, 3
-
-
-def _powers(table: tuple[int, ...]) -> tuple[NDArray[np.int64], Array]:
-    """Sources and signs of none to three turns, each of shape (4, numbers)."""
-    values = np.arange(1, len(table) + 1)
-    rows = [values]
-    for _ in range(3):
-        values = values[np.abs(table) - 1] * np.sign(table)
-        rows.append(values)
-    return np.abs(rows) - 1, np.sign(rows).astype(np.float64)
-
-
-_INPUT_SOURCES, _INPUT_SIGNS = _powers(_INPUTS)
-_ACTION_SOURCES, _ACTION_SIGNS = _powers(_ACTION)
+_ACTION_TURN = _legs_renamed((4, 1, 2, 3))
+_INPUT_TURNS, _ACTION_TURNS = (
+    [np.linalg.matrix_power(turn, count) for count in range(4)]
+    for turn in (_INPUT_TURN, _ACTION_TURN)
+)

@@ -51,8 +51,7 @@ class GymMaze(Simulator):
     def step(self, action: ArrayLike) -> StepResult:
         """Apply an action for one control period; see `Simulator.step`."""
         self._check_running()
-        values, clipped = self._bounded(action)
-        observation, reached = self._advance(values)
+        observation, reached = self._advance(self._bounded(action))
         self._num_steps += 1
         success = self._has_goal and reached
         terminated = self._is_task and success
@@ -61,7 +60,7 @@ class GymMaze(Simulator):
             self._running = False
             ending = 'the goal was reached' if terminated else 'the step limit was reached'
             self._why_not_running = f'{ending} at step {self._num_steps}'
-        return StepResult(observation, terminated, truncated, success, clipped)
+        return StepResult(observation, terminated, truncated, success)
 
     def set_goal(self, goal: ArrayLike) -> None:
         """Move the goal of the running episode; see `Simulator.set_goal`."""
@@ -137,16 +136,16 @@ class GymMaze(Simulator):
             raise ValueError(f'task_id must be from 1 to {self.spec.num_tasks}, got {task_id!r}')
         return int(task_id)
 
-    def _bounded(self, action: ArrayLike) -> tuple[Array, bool]:
-        """The action clipped to [-1, 1], and whether that changed it."""
+    def _bounded(self, action: ArrayLike) -> Array:
+        """The action clipped to [-1, 1]."""
         values = np.asarray(action, dtype=np.float64)
         if values.shape != (self.spec.act_dim,):
             raise ValueError(f'action must have shape ({self.spec.act_dim},), got {values.shape}')
         if np.abs(values).max() <= 1.0:  # false for NaN too
-            return values, False
+            return values
         if not np.isfinite(values).all():
             raise ValueError(f'action must be finite, got {values.tolist()}')
-        return values.clip(-1.0, 1.0), True
+        return values.clip(-1.0, 1.0)
 
 
 def check_seed(seed: int) -> None:

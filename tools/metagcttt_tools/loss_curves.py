@@ -22,6 +22,7 @@ from metagcttt_tools.common.session import use_threads
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from metagcttt_core import Agent
+    from torch import Tensor
 
 _DESCRIPTION = """Draw the losses of test-time training by part: total, actor, critic, value.
 
@@ -115,30 +116,16 @@ def adaptation_losses(
     config: TTTConfig,
     seed: int = 0,
 ) -> dict[str, list[float]]:
-    """The losses before each step that `adapt` would take, `total` and by part."""
-    from metagcttt_core.adaptation.batches import QueryBatches
-    from metagcttt_core.training.optimizers import make_optimizer
-    from metagcttt_core.training.step import gradient_step
+    """The losses before each step of an adaptation, `total` and by part."""
+    from metagcttt_core import adapt
 
-    rng = np.random.default_rng(np.random.SeedSequence(seed).spawn(2)[1])
-    batches = QueryBatches(
-        agent,
-        dataset,
-        support.indices,
-        goal,
-        fix_actor_goal=config.fix_actor_goal,
-        ratio=config.ratio,
-    )
-    expert = agent.clone()
-    parameters = list(expert.trained_parameters(actor_only=config.actor_only))
-    optimizer = make_optimizer(config.optimizer, parameters, config.lr)
     losses: dict[str, list[float]] = {}
-    for batch in batches.steps(config.steps, config.batch_size, rng):
-        loss, parts = gradient_step(
-            expert, optimizer, parameters, batch, actor_only=config.actor_only
-        )
-        for name, value in {'total': loss, **parts}.items():
+
+    def collect(step: int, parts: Mapping[str, Tensor]) -> None:
+        for name, value in parts.items():
             losses.setdefault(name, []).append(float(value))
+
+    adapt(agent, dataset, support, goal, config, seed, on_step=collect)
     return losses
 
 

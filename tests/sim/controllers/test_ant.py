@@ -84,3 +84,18 @@ def test_controller_of_the_package_walks_a_cell_in_forty_steps_without_falling()
         assert walk.falls == 0
         assert walk.speed * walk.period_s * 40 > 4.0
         assert walk.distance_m == pytest.approx(walk.speed * 20.0)
+
+
+# Signed places, from 1, that each number comes from in a quarter turn: the matrices once more.
+INPUTS = (1, 2, 4, -3, 5, 8, -9, 10, 11, 12, -13, 6, 7, 15, -14, 16, 18, -17, 19)
+INPUTS += (22, -23, 24, 25, 26, -27, 20, 21, 29, -28)
+ACTION = (3, 4, 5, -6, 7, 8, 1, -2)
+
+
+@pytest.mark.parametrize(('turn', 'table'), [(turn_inputs, INPUTS), (turn_action, ACTION)])
+def test_turns_are_signed_permutations(turn, table):
+    values = np.random.default_rng(0).normal(size=len(table))
+    expected = values
+    for turns in range(6):
+        np.testing.assert_array_equal(turn(values, turns), expected)
+        expected = np.array([np.sign(place) * expected[abs(place) - 1] for place in table])

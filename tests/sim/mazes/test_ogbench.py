@@ -218,11 +218,8 @@ def test_goal_can_be_an_observation() -> None:
         assert goal.shape == (29,)
 
 
-def test_action_beyond_the_bounds_is_cut_and_says_so(point: Simulator) -> None:
-    assert not point.step((1.0, -1.0)).clipped
-    point.reset_free(seed=0, start_xy=(0.0, 0.0))
+def test_action_beyond_the_bounds_is_clipped(point: Simulator) -> None:
     cut = point.step((5.0, 0.25))
-    assert cut.clipped
     point.reset_free(seed=0, start_xy=(0.0, 0.0))
     np.testing.assert_array_equal(cut.observation, point.step((1.0, 0.25)).observation)
 
