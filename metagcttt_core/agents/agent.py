@@ -15,9 +15,6 @@ from metagcttt_core.agents.config import AgentSettings
 from metagcttt_core.agents.networks import MLP
 
 TensorBatch = dict[str, Tensor]
-OptimizerState = dict[str, dict[str, Tensor]]
-"""Adam's `step`, `exp_avg` and `exp_avg_sq` by name of the parameter."""
-
 _HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
 
 
@@ -28,9 +25,6 @@ class Agent(nn.Module, ABC):
         obs_dim, act_dim: Widths of an observation (and goal) and of an action.
         settings: The agent's settings, defaults resolved.
         metadata: Facts that travel with the weights (`environment`, `history`, ...).
-        optimizer_state: Adam's state at the end of pre-training, if it is known. It travels with
-            the weights, too; clones share it, so replace it and never change it in place.
-        origin: Where the agent comes from, for error messages.
     """
 
     name: ClassVar[str]
@@ -48,8 +42,6 @@ class Agent(nn.Module, ABC):
         self.act_dim = act_dim
         self.settings = settings
         self.metadata: dict[str, Any] = {}
-        self.optimizer_state: OptimizerState | None = None
-        self.origin = f'this {self.name} agent'
         self.actor = MLP(
             2 * obs_dim,
             settings.hidden,
@@ -82,16 +74,8 @@ class Agent(nn.Module, ABC):
 
     def trained_parameters(self, *, actor_only: bool = False) -> Iterator[nn.Parameter]:
         """The parameters an optimiser steps on."""
-        return iter(self.named_trained_parameters(actor_only=actor_only).values())
-
-    def named_trained_parameters(self, *, actor_only: bool = False) -> dict[str, nn.Parameter]:
-        """The parameters an optimiser steps on by name, in the order of `trained_parameters`."""
-        prefix = 'actor.' if actor_only else ''
-        return {
-            name: parameter
-            for name, parameter in self.named_parameters()
-            if parameter.requires_grad and name.startswith(prefix)
-        }
+        module = self.actor if actor_only else self
+        return (parameter for parameter in module.parameters() if parameter.requires_grad)
 
     def fingerprint(self) -> str:
         """Hash of all weights, 16 hexadecimal digits."""
@@ -102,8 +86,8 @@ class Agent(nn.Module, ABC):
         return digest.hexdigest()
 
     def clone(self) -> Self:
-        """An independent copy with equal weights, which shares `optimizer_state`."""
-        return copy.deepcopy(self, {id(self.optimizer_state): self.optimizer_state})
+        """An independent copy with equal weights."""
+        return copy.deepcopy(self)
 
     def log_prob(
         self, observations: Tensor, goals: Tensor, actions: Tensor

@@ -11,7 +11,7 @@ from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.data.relabel import GoalRelabeller
 from metagcttt_core.training.config import Precision, PretrainConfig
 from metagcttt_core.training.numerics import loss_function
-from metagcttt_core.training.optimizers import make_optimizer, pretrained_state
+from metagcttt_core.training.optimizers import make_optimizer
 from metagcttt_core.training.run import TrainingRun
 from metagcttt_core.training.step import gradient_step
 
@@ -37,29 +37,23 @@ def pretrain(
         precision: Of the matrix products; see `loss_function`.
         compiled: Compile the loss; see `loss_function`.
         run: Checkpoints and resume.
-        on_step: Called with the number of steps done, the losses before the last of them
-            (detached tensors) and the agent after it, whose `optimizer_state` the next step
-            changes.
+        on_step: Told the number of steps done, the losses before the last of them (detached
+            tensors) and the agent after it.
 
     Returns:
-        The trained copy, with its `optimizer_state`.
+        The trained copy.
     """
     agent = agent.clone()
-    agent.optimizer_state = None
     run = run or TrainingRun('pretrain', {})
-    first = run.restore(agent)
     relabeller = GoalRelabeller(dataset, agent.settings.goals, agent.settings.discount)
-    parameters = agent.named_trained_parameters()
-    state = pretrained_state(agent) if agent.optimizer_state is not None else None
-    optimizer = make_optimizer('adam', parameters.values(), config.lr, state)
-    # The optimiser's own tensors: whoever saves the agent saves the state of the same step.
-    agent.optimizer_state = {name: optimizer.state[each] for name, each in parameters.items()}
+    parameters = list(agent.trained_parameters())
+    optimizer = make_optimizer('adam', parameters, config.lr)
     losses = loss_function(agent, precision=precision, compiled=compiled)
-    for step in range(first, config.steps):
+    for step in range(run.restore(agent, optimizer), config.steps):
         batch = relabeller.sample(config.batch_size, np.random.default_rng((seed, step)))
         loss, parts = gradient_step(
-            agent, optimizer, list(parameters.values()), agent.tensors(batch), losses=losses
+            agent, optimizer, parameters, agent.tensors(batch), losses=losses
         )
         on_step(step + 1, {'loss': loss, **parts}, agent)
-        run.step_done(agent, step + 1, config.steps)
+        run.step_done(agent, optimizer, step + 1, config.steps)
     return agent
