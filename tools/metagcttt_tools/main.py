@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 import tyro
 
+from metagcttt_tools.common.cli import fail
+
 _DESCRIPTION = """Goal-conditioned policies that adapt at test time, from data to robot.
 
 Each program teaches with --help and takes --preset NAME: metagcttt presets lists them.
@@ -70,6 +72,20 @@ PROGRAMS: dict[str, Program | Group] = {
     'pack-assets': Program('pack_assets', 'Pack policies and data into the assets of the demo.'),
 }
 
+# What is not part of the smallest installation, and what brings it.
+EXTRAS = {
+    'gymnasium': 'mazes',
+    'gymnasium_robotics': 'mazes',
+    'h5py': 'minari',
+    'matplotlib': 'plots',
+    'mcap': 'recordings',
+    'mcap_ros2': 'recordings',
+    'mujoco': 'mazes',
+    'ogbench': 'mazes',
+    'tensorboard': 'plots',
+}
+_ROS = frozenset({'metagcttt', 'metagcttt_interfaces', 'rclpy'})
+
 
 def main(argv: list[str] | None = None) -> None:
     """Run the command line: `metagcttt PROGRAM [ARGUMENT...]`."""
@@ -82,7 +98,7 @@ def main(argv: list[str] | None = None) -> None:
         name, *arguments = arguments
         program = programs[name]
         if isinstance(program, Program):
-            import_module(f'metagcttt_tools.{program.module}').main(arguments)
+            _run(program, arguments)
             return
         prog, description, programs = f'{prog} {name}', program.summary, dict(program.programs)
     # Help or a mistake is left, and neither takes the programs themselves.
@@ -92,6 +108,19 @@ def main(argv: list[str] | None = None) -> None:
         prog=prog,
         description=description,
     )
+
+
+def _run(program: Program, arguments: list[str]) -> None:
+    try:
+        import_module(f'metagcttt_tools.{program.module}').main(arguments)
+    except ModuleNotFoundError as error:
+        missing = (error.name or '').partition('.')[0]
+        if missing in EXTRAS:
+            install = f'pip install "metagcttt-core[{EXTRAS[missing]}]"'
+            fail(f'this takes {missing}, which is not installed: {install}')
+        if missing in _ROS:
+            fail(f'this takes ROS 2 and the workspace ({missing} is missing): make setup')
+        raise
 
 
 def _described(summary: str) -> Callable[[], None]:
