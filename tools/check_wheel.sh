@@ -18,6 +18,9 @@ die() {
   exit 1
 }
 
+# shellcheck source=tools/install_torch.sh
+source "$root/tools/install_torch.sh"
+
 # Only what is in the repository, so that neither old build outputs nor loose files get in.
 mkdir "$work"/{source,elsewhere}
 (cd "$root" && git ls-files -z pyproject.toml README.md metagcttt_core sim_bridge tools |
@@ -35,6 +38,7 @@ install() { # EXTRAS
   say "installed $(basename "$wheel")$1"
 }
 
+install_torch "$work/venv/bin/python" -qq
 install ''
 site=$("$work/venv/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
 tops=$(cut -d/ -f1 "$site"/metagcttt_core-*.dist-info/RECORD | sort -u | grep -v 'dist-info\|^\.\.' |

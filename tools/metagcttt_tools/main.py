@@ -117,6 +117,8 @@ def _run(program: Program, arguments: list[str]) -> None:
         missing = (error.name or '').partition('.')[0]
         if missing in EXTRAS:
             install = f'pip install "metagcttt-core[{EXTRAS[missing]}]"'
+            if missing == 'ogbench' and sys.version_info >= (3, 13):
+                install = 'pip install --no-deps ogbench'  # see pyproject.toml
             fail(f'this takes {missing}, which is not installed: {install}')
         if missing in _ROS:
             fail(f'this takes ROS 2 and the workspace ({missing} is missing): make setup')
