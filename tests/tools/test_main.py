@@ -3,6 +3,8 @@
 from importlib.metadata import packages_distributions
 import json
 from pathlib import Path
+import shlex
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -72,3 +74,41 @@ def test_run_is_logged_to_its_file_without_tensorboard(tmp_path, monkeypatch, ca
     assert json.loads((tmp_path / 'metrics.jsonl').read_text())['loss'] == 0.5
     told = 'no TensorBoard logs: pip install "metagcttt-core[plots]"\n'
     assert capsys.readouterr().err == told
+
+
+@pytest.fixture(scope='module')
+def completion(tmp_path_factory) -> Path:
+    script = tmp_path_factory.mktemp('completion') / 'metagcttt.bash'
+    with pytest.raises(SystemExit):
+        main(['--tyro-write-completion', 'bash', str(script)])
+    return script
+
+
+@pytest.mark.parametrize(
+    ('typed', 'offered'),
+    [
+        (['metagcttt', 'meta-tr'], 'meta-train'),
+        (['metagcttt', 'meta-train', '--meta.inner-s'], '--meta.inner-steps'),
+        (['metagcttt', 'meta-train', '--meta.algorithm', 'fom'], 'fomaml'),
+        (['metagcttt', 'pretrain', '--pres'], '--preset'),
+        (['metagcttt', 'benchmark', 'sim', '--rou'], '--rounds'),
+    ],
+)
+def test_shell_completes_programs_and_their_flags(typed, offered, completion) -> None:
+    words = ' '.join(map(shlex.quote, typed))
+    script = f"""source {completion}; COMP_WORDS=({words}) COMP_CWORD={len(typed) - 1}
+        $(complete -p metagcttt | sed 's/.*-F \\([^ ]*\\).*/\\1/')
+        printf '%s\\n' "${{COMPREPLY[@]}}" """
+    shell = subprocess.run(['bash', '-c', script], capture_output=True, text=True)
+    assert shell.stdout.split() == [offered], shell.stderr
+
+
+@pytest.mark.parametrize('shell', ['bash', 'zsh', 'tcsh', 'fish'])
+def test_every_shell_gets_a_script_with_the_flags(shell, capsys) -> None:
+    with pytest.raises(SystemExit):
+        main(['--tyro-print-completion', shell])
+    script = capsys.readouterr().out
+    assert 'meta.outer-steps' in script
+    if shutil.which(shell):
+        checked = subprocess.run([shell, '-n'], input=script, capture_output=True, text=True)
+        assert checked.returncode == 0, checked.stderr

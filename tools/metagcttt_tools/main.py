@@ -1,19 +1,22 @@
 """The command `metagcttt`: one subcommand a program, imported when it is asked for."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import reduce
 from importlib import import_module
 from importlib.metadata import version
+from operator import or_
 import sys
-from typing import NamedTuple
+from typing import Annotated, Any, NamedTuple
 
+from pydantic import create_model
 import tyro
 
-from metagcttt_tools.common.cli import fail
+from metagcttt_tools.common.cli import fail, flags_of
 
 _DESCRIPTION = """Goal-conditioned policies that adapt at test time, from data to robot.
 
 Each program teaches with --help and takes --preset NAME: metagcttt presets lists them.
-metagcttt --tyro-print-completion bash (or zsh, tcsh) prints a completion script."""
+metagcttt --tyro-print-completion bash (or zsh, tcsh, fish) prints a completion script."""
 
 
 class Program(NamedTuple):
@@ -93,6 +96,8 @@ def main(argv: list[str] | None = None) -> None:
     if arguments == ['--version']:
         print(f'metagcttt {version("metagcttt-core")}')
         return
+    if arguments and arguments[0].startswith('--tyro-'):
+        tyro.cli(_every_flag(PROGRAMS), args=arguments, prog='metagcttt')
     prog, description, programs = 'metagcttt', _DESCRIPTION, PROGRAMS
     while arguments and arguments[0] in programs:
         name, *arguments = arguments
@@ -112,7 +117,7 @@ def main(argv: list[str] | None = None) -> None:
 
 def _run(program: Program, arguments: list[str]) -> None:
     try:
-        import_module(f'metagcttt_tools.{program.module}').main(arguments)
+        _main_of(program)(arguments)
     except ModuleNotFoundError as error:
         missing = (error.name or '').partition('.')[0]
         if missing in EXTRAS:
@@ -123,6 +128,26 @@ def _run(program: Program, arguments: list[str]) -> None:
         if missing in _ROS:
             fail(f'this takes ROS 2 and the workspace ({missing} is missing): make setup')
         raise
+
+
+def _every_flag(programs: Mapping[str, Program | Group]) -> Any:
+    """The type of a command line with all programs and their flags, which imports them all."""
+    subcommands: list[Any] = []
+    for name, program in programs.items():
+        flags: Any
+        if isinstance(program, Program):
+            flags = flags_of(_main_of(program))
+        else:
+            inner: Any = Annotated[_every_flag(program.programs), tyro.conf.arg(name='')]
+            flags = create_model(name, program=(inner, ...))
+        described = tyro.conf.subcommand(name, description=program.summary, prefix_name=False)
+        subcommands.append(Annotated[flags, described])
+    return reduce(or_, subcommands)
+
+
+def _main_of(program: Program) -> Callable[[list[str]], None]:
+    main: Callable[[list[str]], None] = import_module(f'metagcttt_tools.{program.module}').main
+    return main
 
 
 def _described(summary: str) -> Callable[[], None]:
