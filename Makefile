@@ -1,7 +1,7 @@
 # Every target does the set-up that it needs; `make help` lists them.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test assets lint clean
+.PHONY: help setup demo test assets lint wheel clean
 
 PYTHON := .venv/bin/python
 METAGCTTT := .venv/bin/metagcttt
@@ -38,6 +38,9 @@ lint: setup ## check style, formatting and types
 	@$(PYTHON) -m ruff check .
 	@$(PYTHON) -m ruff format --check .
 	@$(PYTHON) -m mypy
+
+wheel: setup ## build the wheel and try it in a fresh environment
+	@tools/check_wheel.sh
 
 clean: ## remove .venv, the built workspace, caches and out/
 	@rm -rf .venv .setup.lock ros2_ws/build ros2_ws/install ros2_ws/log out \

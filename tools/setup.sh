@@ -18,6 +18,9 @@ die() {
   exit 1
 }
 
+# shellcheck source=tools/install_torch.sh
+source "$root/tools/install_torch.sh"
+
 choose_ros() {
   # A Python with the ROS wheels leaves these marks on its children; they mislead another one.
   if [ -n "${_ROS_WHEELS_BOOTSTRAP_COMPLETE:-}" ]; then
@@ -72,7 +75,7 @@ find_python() {
 digest() { { printf '%s\n' "$@" && cat; } | sha256sum | cut -d' ' -f1; }
 
 packages_digest() {
-  (cd "$root" && cat constraints.txt pyproject.toml tools/setup.sh tools/fix_ros_wheels.py) |
+  (cd "$root" && cat constraints.txt pyproject.toml tools/{setup,install_torch}.sh tools/fix_ros_wheels.py) |
     digest "$root" "$ros"
 }
 
@@ -86,23 +89,41 @@ up_to_date() { [ "$(cat "$stamps/$1" 2>/dev/null)" = "$2" ]; } # STAGE DIGEST
 install_packages() {
   local extras=dev,workspace
   if up_to_date made-for "$root $ros" && "$venv/bin/python" -c '' 2>/dev/null; then
-    say 'bringing .venv up to date'
+    say '1 of 4: .venv is there, bringing it up to date'
   else
     find_python
-    say "creating .venv with $("$python" --version)"
+    say "1 of 4: creating .venv with $("$python" --version)"
     rm -rf "$venv" "$workspace"/{build,install,log}
     "$python" -m venv "$venv"
   fi
   rm -rf "$stamps"
   [ "$ros" = system ] || extras=$extras,ros,ros-build
-  local pip=("$venv/bin/python" -m pip --disable-pip-version-check -qq)
-  say 'installing packages (minutes the first time)'
-  "${pip[@]}" install -c "$root/constraints.txt" pip setuptools
+  local pip=("$venv/bin/python" -m pip --disable-pip-version-check)
+  "${pip[@]}" -qq install -c "$root/constraints.txt" pip setuptools
+  say '2 of 4: PyTorch'
+  install_torch "$venv/bin/python" --disable-pip-version-check
+  say "3 of 4: packages ($(grep -c == "$root/constraints.txt") are pinned; minutes the first time)"
   "${pip[@]}" install -c "$root/constraints.txt" --no-build-isolation -e "$root[$extras]"
+  # From Python 3.13 on, a package that ogbench names and its mazes do without cannot be had.
+  "$venv/bin/python" -c 'import sys; sys.exit(sys.version_info < (3, 13))' &&
+    "${pip[@]}" install -c "$root/constraints.txt" --no-deps ogbench
   [ "$ros" = system ] || "$venv/bin/python" "$root/tools/fix_ros_wheels.py" "$venv"
   mkdir -p "$stamps"
   echo "$root $ros" >"$stamps/made-for"
   packages_digest >"$stamps/packages"
+}
+
+# What colcon starts and finishes, and how far cmake is.
+build_progress() {
+  local line shown=
+  while IFS= read -r line; do
+    if [[ $line =~ ^(Starting|Finished|Failed) ]]; then
+      say "  $line"
+    elif [[ $line =~ ^\[\ *([0-9]*0%)\] && ${BASH_REMATCH[1]} != "$shown" ]]; then
+      shown=${BASH_REMATCH[1]}
+      say "  $shown"
+    fi
+  done
 }
 
 build_workspace() {
@@ -114,11 +135,11 @@ build_workspace() {
   rm -rf "$workspace"/{build,install}/metagcttt
   touch "$stamps/building"
   mkdir -p "$workspace/log"
-  say 'building the ROS workspace'
+  say "4 of 4: building the ROS workspace (a minute or two; all its output is in $log)"
   [ "$ros" = system ] || export AMENT_PREFIX_PATH=$venv CMAKE_PREFIX_PATH=$venv
   (cd "$workspace" && PATH=$venv/bin:$PATH "$venv/bin/python" -m colcon build \
     --base-paths src --event-handlers console_direct+ --cmake-args -DCMAKE_BUILD_TYPE=Release \
-    -DBUILD_TESTING=OFF "-DPython3_EXECUTABLE=$venv/bin/python") >"$log" 2>&1 || {
+    -DBUILD_TESTING=OFF "-DPython3_EXECUTABLE=$venv/bin/python") 2>&1 | tee "$log" | build_progress || {
     tail -n 60 "$log" >&2
     die "colcon could not build the ROS workspace; its log ends above and is in $log"
   }

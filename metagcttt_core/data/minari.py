@@ -43,7 +43,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         import h5py
     except ModuleNotFoundError as error:
         raise DatasetError(
-            f'{path}: reading Minari datasets takes h5py: pip install -c constraints.txt h5py'
+            f'{path}: reading Minari datasets takes h5py: pip install "metagcttt-core[minari]"'
         ) from error
     file_path = _file_of(path)
     try:

@@ -14,8 +14,8 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 NEEDED = (
-    *('bash', 'cat', 'cut', 'dirname', 'find', 'flock', 'rm', 'sha256sum', 'sort', 'tail'),
-    *('uname', 'xargs', 'make', 'cmake', 'c++'),
+    *('bash', 'cat', 'cut', 'dirname', 'find', 'flock', 'grep', 'ln', 'mkdir', 'rm', 'sha256sum'),
+    *('sort', 'tail', 'tee', 'timeout', 'touch', 'uname', 'xargs', 'make', 'cmake', 'c++'),
 )
 PYTHONS = ('python3.11', 'python3.12', 'python3.13', 'python3')
 
@@ -27,12 +27,13 @@ class Machine:
         self.root = folder / 'checkout'
         self.path = folder / 'bin'
         (self.root / 'tools').mkdir(parents=True)
-        (self.root / 'ros2_ws').mkdir()
+        (self.root / 'ros2_ws' / 'src').mkdir(parents=True)
         self.path.mkdir()
         for name in (
             'constraints.txt',
             'pyproject.toml',
             'tools/setup.sh',
+            'tools/install_torch.sh',
             'tools/fix_ros_wheels.py',
         ):
             shutil.copy(ROOT / name, self.root / name)
@@ -125,6 +126,79 @@ def test_second_setup_waits_for_the_first(machine: Machine, hold_lock) -> None:
     assert 'no suitable Python' in process.communicate(timeout=60)[1]
 
 
+# Stands for Python: writes down what pip is asked for, and builds a workspace in four steps.
+PYTHON = r"""
+case "$*" in
+  *'-m venv'*) mkdir -p "$3/bin" && cat "$0" >"$3/bin/python" && chmod +x "$3/bin/python" ;;
+  *-m\ pip*) echo "$*" >>"$HOME/pip" ;;
+  *urlopen*) exit "${NO_ANSWER:-0}" ;;
+  *'version_info < (3, 13)'*) exit "${BEFORE_3_13:-0}" ;;
+  *purelib*) echo "$HOME" ;;
+  *'-m colcon'*) printf '%s\n' 'Starting >>> a' '[  5%] x' '[ 10%] y' '[ 10%] z'
+    echo 'Finished <<< a' ;;
+esac"""
+CPU_BUILDS = 'install --no-deps --index-url https://download.pytorch.org/whl/cpu'
+
+
+@pytest.fixture
+def set_up(machine: Machine, tmp_path: Path) -> Callable[..., tuple[str, str]]:
+    """Runs the set-up to its end; returns what it printed and what pip was asked for."""
+
+    def run(**environment: str) -> tuple[str, str]:
+        machine.tool('python3.11', PYTHON)
+        machine.tool('chmod', f'exec {shutil.which("chmod")} "$@"')
+        process = machine.start(HOME=str(tmp_path), **environment)
+        printed, errors = process.communicate(timeout=60)
+        assert process.returncode == 0, errors
+        return printed, (tmp_path / 'pip').read_text()
+
+    return run
+
+
+needs_no_gpu = pytest.mark.skipif(
+    any(Path(device).exists() for device in ('/dev/nvidiactl', '/dev/dxg')),
+    reason='the machine has an NVIDIA GPU, for which set-up takes other packages',
+)
+
+
+def test_every_stage_says_that_it_begins_and_how_far_it_is(set_up) -> None:
+    printed, _ = set_up()
+    stages = [line for line in printed.splitlines() if ' of 4: ' in line]
+    assert [line[:14] for line in stages] == [f'setup: {n} of 4:' for n in (1, 2, 3, 4)]
+    assert f'{len(pins())} are pinned' in stages[2]
+    progress = ['setup:   Starting >>> a', 'setup:   10%', 'setup:   Finished <<< a']
+    assert printed.splitlines()[-3:] == progress
+
+
+@needs_no_gpu
+def test_pytorch_comes_without_cuda_where_there_is_no_gpu(set_up) -> None:
+    _, asked = set_up()
+    first, second = [line for line in asked.splitlines() if 'setuptools' not in line][:2]
+    assert CPU_BUILDS in first
+    assert first.endswith('torch')
+    assert '-e ' in second
+
+
+@needs_no_gpu
+def test_set_up_goes_on_without_the_index_of_cpu_builds(set_up) -> None:
+    printed, asked = set_up(NO_ANSWER='1')
+    assert 'no answer from https://download.pytorch.org/whl/cpu' in printed
+    assert '--index-url' not in asked
+
+
+def test_gpu_gets_the_build_with_cuda(machine: Machine, set_up) -> None:
+    machine.tool('nvidia-smi', 'exit 0')
+    printed, asked = set_up()
+    assert 'PyTorch comes with CUDA' in printed
+    assert '--index-url' not in asked
+
+
+@pytest.mark.parametrize(('before', 'alone'), [('0', True), ('1', False)])
+def test_ogbench_comes_alone_from_python_3_13_on(before: str, alone: bool, set_up) -> None:
+    _, asked = set_up(BEFORE_3_13=before)
+    assert ('--no-deps ogbench' in asked) == alone
+
+
 def pins() -> dict[str, str]:
     lines = (ROOT / 'constraints.txt').read_text().splitlines()
     pairs = (line.split('==') for line in lines if line and not line.startswith('#'))
@@ -154,7 +228,8 @@ def test_constraints_pin_all_that_is_installed() -> None:
                 loose.append(f'{name} is needed and not installed')
                 continue
             # PyTorch's GPU builds pin their own libraries.
-            if pins().get(name) != version and not re.match('nvidia-|triton|cuda-', name):
+            pinned = name == 'metagcttt-core' or pins().get(name) == version
+            if not pinned and not re.match('nvidia-|triton|cuda-', name):
                 loose.append(f'{name} is {version}, pinned to {pins().get(name)}')
             if (name, wanted) not in seen:
                 seen.add((name, wanted))

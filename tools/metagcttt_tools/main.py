@@ -1,17 +1,22 @@
 """The command `metagcttt`: one subcommand a program, imported when it is asked for."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import reduce
 from importlib import import_module
 from importlib.metadata import version
+from operator import or_
 import sys
-from typing import NamedTuple
+from typing import Annotated, Any, NamedTuple
 
+from pydantic import create_model
 import tyro
+
+from metagcttt_tools.common.cli import fail, flags_of
 
 _DESCRIPTION = """Goal-conditioned policies that adapt at test time, from data to robot.
 
 Each program teaches with --help and takes --preset NAME: metagcttt presets lists them.
-metagcttt --tyro-print-completion bash (or zsh, tcsh) prints a completion script."""
+metagcttt --tyro-print-completion bash (or zsh, tcsh, fish) prints a completion script."""
 
 
 class Program(NamedTuple):
@@ -70,6 +75,20 @@ PROGRAMS: dict[str, Program | Group] = {
     'pack-assets': Program('pack_assets', 'Pack policies and data into the assets of the demo.'),
 }
 
+# What is not part of the smallest installation, and what brings it.
+EXTRAS = {
+    'gymnasium': 'mazes',
+    'gymnasium_robotics': 'mazes',
+    'h5py': 'minari',
+    'matplotlib': 'plots',
+    'mcap': 'recordings',
+    'mcap_ros2': 'recordings',
+    'mujoco': 'mazes',
+    'ogbench': 'mazes',
+    'tensorboard': 'plots',
+}
+_ROS = frozenset({'metagcttt', 'metagcttt_interfaces', 'rclpy'})
+
 
 def main(argv: list[str] | None = None) -> None:
     """Run the command line: `metagcttt PROGRAM [ARGUMENT...]`."""
@@ -77,12 +96,14 @@ def main(argv: list[str] | None = None) -> None:
     if arguments == ['--version']:
         print(f'metagcttt {version("metagcttt-core")}')
         return
+    if arguments and arguments[0].startswith('--tyro-'):
+        tyro.cli(_every_flag(PROGRAMS), args=arguments, prog='metagcttt')
     prog, description, programs = 'metagcttt', _DESCRIPTION, PROGRAMS
     while arguments and arguments[0] in programs:
         name, *arguments = arguments
         program = programs[name]
         if isinstance(program, Program):
-            import_module(f'metagcttt_tools.{program.module}').main(arguments)
+            _run(program, arguments)
             return
         prog, description, programs = f'{prog} {name}', program.summary, dict(program.programs)
     # Help or a mistake is left, and neither takes the programs themselves.
@@ -92,6 +113,41 @@ def main(argv: list[str] | None = None) -> None:
         prog=prog,
         description=description,
     )
+
+
+def _run(program: Program, arguments: list[str]) -> None:
+    try:
+        _main_of(program)(arguments)
+    except ModuleNotFoundError as error:
+        missing = (error.name or '').partition('.')[0]
+        if missing in EXTRAS:
+            install = f'pip install "metagcttt-core[{EXTRAS[missing]}]"'
+            if missing == 'ogbench' and sys.version_info >= (3, 13):
+                install = 'pip install --no-deps ogbench'  # see pyproject.toml
+            fail(f'this takes {missing}, which is not installed: {install}')
+        if missing in _ROS:
+            fail(f'this takes ROS 2 and the workspace ({missing} is missing): make setup')
+        raise
+
+
+def _every_flag(programs: Mapping[str, Program | Group]) -> Any:
+    """The type of a command line with all programs and their flags, which imports them all."""
+    subcommands: list[Any] = []
+    for name, program in programs.items():
+        flags: Any
+        if isinstance(program, Program):
+            flags = flags_of(_main_of(program))
+        else:
+            inner: Any = Annotated[_every_flag(program.programs), tyro.conf.arg(name='')]
+            flags = create_model(name, program=(inner, ...))
+        described = tyro.conf.subcommand(name, description=program.summary, prefix_name=False)
+        subcommands.append(Annotated[flags, described])
+    return reduce(or_, subcommands)
+
+
+def _main_of(program: Program) -> Callable[[list[str]], None]:
+    main: Callable[[list[str]], None] = import_module(f'metagcttt_tools.{program.module}').main
+    return main
 
 
 def _described(summary: str) -> Callable[[], None]:

@@ -1,6 +1,7 @@
 """Command lines from typed settings: defaults, then a preset, then flags."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextvars import ContextVar
 import os
 import re
 import sys
@@ -16,8 +17,18 @@ from metagcttt_tools.common.resume import continued, Resumable
 SettingsT = TypeVar('SettingsT', bound=Settings)
 
 
+_only_asked: ContextVar[bool] = ContextVar('_only_asked', default=False)
+
+
 class _Preset(BaseModel):
     preset: Annotated[str | None, tyro.conf.arg(help='')] = None
+
+
+class _Asked(BaseException):
+    """Ends a program where it asks for its settings."""
+
+    def __init__(self, model: type[Settings]) -> None:
+        self.model = model
 
 
 def parse(
@@ -45,6 +56,8 @@ def parse(
         The validated settings. A wrong value ends the process with status 2 and a line that names
         it.
     """
+    if _only_asked.get():
+        raise _Asked(model)
     section = section or re.sub(r'\W', '_', program)
     arguments = list(sys.argv[1:] if argv is None else argv)
     preset, rest = tyro.cli(_Preset, args=arguments, return_unknown_args=True, add_help=False)
@@ -69,6 +82,18 @@ def parse(
         fail(*error_lines(error))
     except ValueError as error:
         fail(str(error))
+
+
+def flags_of(main: Callable[[list[str]], None]) -> type[BaseModel]:
+    """A model with every flag of a program, whose `main` starts by reading its settings."""
+    token = _only_asked.set(True)
+    try:
+        main([])
+    except _Asked as asked:
+        return type(asked.model.__name__, (asked.model, _Preset), {'__doc__': ''})
+    finally:
+        _only_asked.reset(token)
+    raise AssertionError(f'{main.__module__} read no settings')
 
 
 def _preset_help(section: str) -> str:

@@ -1,13 +1,20 @@
 """What a long-running tool records: TensorBoard and `metrics.jsonl`."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 import json
 from pathlib import Path
+import sys
 import time
-from typing import Any, Self
+from typing import Any, Self, TYPE_CHECKING
 
 from metagcttt_core.files import atomic_write
 import numpy as np
+
+if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
 
 METRICS = 'metrics.jsonl'
 
@@ -21,8 +28,6 @@ class RunLog:
 
     def __init__(self, folder: Path, first_step: int) -> None:
         """Open the logs in `folder`; lines of a resumed run beyond `first_step` are dropped."""
-        from torch.utils.tensorboard import SummaryWriter
-
         path = folder / METRICS
         self.records: list[dict[str, Any]] = []
         if first_step > 0 and path.exists():
@@ -30,7 +35,7 @@ class RunLog:
         with atomic_write(path) as file:
             file.writelines((json.dumps(record) + '\n').encode() for record in self.records)
         self._file = path.open('a', encoding='utf-8')
-        self._writer = SummaryWriter(str(folder / 'tensorboard'), purge_step=first_step)
+        self._writer = _tensorboard(folder / 'tensorboard', first_step)
 
     def write(
         self,
@@ -58,6 +63,8 @@ class RunLog:
             record['warnings'] = list(warnings)
         self._file.write(json.dumps(record) + '\n')
         self._file.flush()
+        if self._writer is None:
+            return
         for name, value in known.items():
             self._writer.add_scalar(name, value, step)
         for name, values in (samples or {}).items():
@@ -68,7 +75,8 @@ class RunLog:
     def close(self) -> None:
         """Flush and close."""
         self._file.close()
-        self._writer.close()
+        if self._writer is not None:
+            self._writer.close()
 
     def __enter__(self) -> Self:
         """The log itself."""
@@ -91,6 +99,16 @@ class SilentLog(RunLog):
 
     def close(self) -> None:
         """Nothing to close."""
+
+
+def _tensorboard(folder: Path, first_step: int) -> SummaryWriter | None:
+    """The logs in `folder`; none, and a line that says so, where TensorBoard is not installed."""
+    if find_spec('tensorboard') is None:
+        print('no TensorBoard logs: pip install "metagcttt-core[plots]"', file=sys.stderr)
+        return None
+    from torch.utils.tensorboard import SummaryWriter
+
+    return SummaryWriter(str(folder), purge_step=first_step)
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
+from importlib.util import find_spec
 import os
 from pathlib import Path
 import signal
@@ -206,7 +207,8 @@ def provenance() -> dict[str, Any]:
         ).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         commit = 'unknown'  # not a checkout, or no git
-    return {'commit': commit, 'versions': {name: version(name) for name in _PACKAGES}}
+    versions = {name: version(name) for name in _PACKAGES if find_spec(name)}
+    return {'commit': commit, 'versions': versions}
 
 
 def write_settings(folder: Path, settings: Settings) -> None:
