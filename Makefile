@@ -42,6 +42,6 @@ lint: setup ## check style, formatting and types
 wheel: setup ## build the wheel and try it in a fresh environment
 	@tools/check_wheel.sh
 
-clean: ## remove .venv, the built workspace, caches and out/
-	@rm -rf .venv .setup.lock ros2_ws/build ros2_ws/install ros2_ws/log out \
+clean: ## remove .venv, the built workspace and caches; data/ and out/ stay
+	@rm -rf .venv .setup.lock ros2_ws/build ros2_ws/install ros2_ws/log build dist \
 		*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
