@@ -17,7 +17,7 @@ _WARM_UP_STEPS = 3
 
 
 class GraphedInnerLoop:
-    """What `run_inner_loop` does, to float tolerance, without launching each kernel anew.
+    """`run_inner_loop` on a GPU, equal to float tolerance, without launching each kernel anew.
 
     A graph reads and writes the memory it was captured with: one working copy of the agent, its
     optimiser's state and one batch, all of which are filled before they are used. So every inner
@@ -95,7 +95,7 @@ class GraphedInnerLoop:
 
 
 def captured(step: Callable[[], Tensor]) -> tuple[Callable[[], None], Tensor]:
-    """What repeats `step` on the current GPU, and the tensor that holds its result afterwards.
+    """A function that repeats `step` on the current GPU, and the tensor of its result.
 
     The step runs a few times before, on a side stream, as PyTorch's notes on CUDA graphs ask for.
     """

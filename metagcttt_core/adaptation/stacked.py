@@ -22,7 +22,7 @@ def run_inner_loops(
     optimizer: OptimizerName = 'adam',
     actor_only: bool = False,
 ) -> list[Adaptation]:
-    """What `run_inner_loop` returns for each task, to float tolerance, adapted together.
+    """The results of `run_inner_loop` for several tasks, equal to float tolerance.
 
     Adam and gradient descent treat every weight on its own, so one optimiser over stacked weights
     is one optimiser per task. Memory grows with the number of tasks, not with that of steps.

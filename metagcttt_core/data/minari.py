@@ -130,7 +130,7 @@ def _observations(group: Any, path: Path) -> np.ndarray:
 
 
 def _member(group: Any, name: str, path: Path) -> Any:
-    """What a group holds under a name; links to other files or places are not followed."""
+    """The member of a group; links to other files or places are refused."""
     link = group.get(name, getlink=True)
     if type(link).__name__ != 'HardLink':
         raise DatasetError(f'{path}: {group.name}/{name} is a link, which is not followed')

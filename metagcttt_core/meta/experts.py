@@ -85,7 +85,7 @@ def adapt_to_tasks(
 def make_inner_loops(
     base: Agent, config: MetaConfig, *, together: bool | None = None, cuda_graphs: bool = True
 ) -> InnerLoops:
-    """What adapts agents like `base` to all tasks of a meta-batch.
+    """A function that adapts agents like `base` to all tasks of a meta-batch.
 
     Args:
         base: The agent; its device and size decide what is fastest.
@@ -117,7 +117,7 @@ def make_inner_loops(
 
 
 def adapts_together(agent: Agent, config: MetaConfig) -> bool:
-    """Whether the tasks of a meta-batch are adapted at once: where that is faster."""
+    """True if adapting the tasks of a meta-batch together is faster."""
     if agent.device.type != 'cpu':
         return config.meta_batch_size > 1
     weights = agent.trained_parameters(actor_only=config.actor_only)

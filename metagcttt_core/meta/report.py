@@ -1,4 +1,4 @@
-"""What an outer step tells about itself: numbers only, so that keeping them costs nothing."""
+"""Reports of outer steps: numbers only, so that keeping them is cheap."""
 
 from dataclasses import dataclass
 from typing import Self

@@ -1,4 +1,4 @@
-"""How losses are computed: number formats and compilation. Weights and optimiser stay float32."""
+"""Numerics of the loss: precision and compilation. Weights and optimiser stay float32."""
 
 from collections.abc import Callable
 from typing import Any, Literal

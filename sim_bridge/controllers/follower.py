@@ -1,4 +1,4 @@
-"""What a direction follower is, and those that need no learning."""
+"""The interface of direction followers, and those without learning."""
 
 from typing import Protocol
 

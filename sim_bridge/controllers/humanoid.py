@@ -50,7 +50,7 @@ class HumanoidFollower(LearnedFollower):
 
 
 def policy_inputs(observations: Array, quaternions: Array, directions: Array) -> Array:
-    """What the policy sees, in the frame of the torso, which needs no heading to be defined.
+    """The inputs of the policy in the torso frame, which is defined in any posture.
 
     Joint angles (21), height of the head, the vertical (3), hands and feet (12), velocity of the
     centre of mass (3), angular velocity / 4 (3), joint velocities / 10 (21) and the direction
@@ -112,12 +112,12 @@ def rotation(quaternions: Array) -> Array:
 
 
 def mirror_inputs(inputs: NDArray[np.floating]) -> NDArray[np.floating]:
-    """What the policy's mirror image sees, left and right being exchanged, shape (..., 67)."""
+    """The inputs with left and right exchanged, shape (..., 67)."""
     return inputs[..., INPUT_SOURCES] * INPUT_SIGNS
 
 
 def mirror_action(action: NDArray[np.floating]) -> NDArray[np.floating]:
-    """What the mirror image does, shape (..., 21)."""
+    """The action with left and right exchanged, shape (..., 21)."""
     return action[..., ACTION_SOURCES] * ACTION_SIGNS
 
 

@@ -1,4 +1,4 @@
-"""Where the humanoid learns to walk: many of OGBench's, on a floor or in mazes, side by side."""
+"""Training environment of the humanoid: many at once, on a floor or in mazes."""
 
 from dataclasses import dataclass
 import math
@@ -35,7 +35,7 @@ _FACING = 64  # place of the direction's part along the torso's x axis among the
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """What the humanoids meet.
+    """The conditions of training in one stage.
 
     Attributes:
         floors: Humanoids on an open floor.
@@ -63,7 +63,7 @@ class Course:
 
 @dataclass(frozen=True, slots=True)
 class GroundStep:
-    """What one control step of n humanoids led to.
+    """The outcome of one control step of n humanoids.
 
     Attributes:
         next_inputs: What the policy would see next were its direction kept, shape (n, 67).

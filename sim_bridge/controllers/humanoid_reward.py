@@ -1,4 +1,4 @@
-"""What the humanoid is rewarded for while it learns to walk."""
+"""The reward of the humanoid while it learns to walk."""
 
 import numpy as np
 

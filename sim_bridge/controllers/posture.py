@@ -1,4 +1,4 @@
-"""Whether a robot stands or has fallen, from its generalised positions."""
+"""Posture of a robot, standing or fallen, from its generalised positions."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,6 @@ def has_fallen(qpos: np.ndarray) -> NDArray[np.bool_]:
 
 
 def count_falls(qpos: np.ndarray) -> int:
-    """How often a robot fell in one episode, by its positions of shape (T, nq) in order."""
+    """Number of falls in one episode, given generalised positions of shape (T, nq)."""
     fallen = has_fallen(qpos)
     return int(fallen[0]) + int((fallen[1:] & ~fallen[:-1]).sum())

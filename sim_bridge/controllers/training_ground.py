@@ -1,4 +1,4 @@
-"""Where the ant learns to follow a direction: on an open floor."""
+"""Training environment of the ant: an open floor."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -189,7 +189,7 @@ class OGBenchMaze(GymMaze):
             np.random.set_state(outside)
 
     def _is_near_teleport(self) -> bool:
-        """Whether the next step might end in a teleport, whose exit is drawn at random."""
+        """True if the next step may end in a teleport, whose exit is random."""
         return any(math.dist(self.position, xy) <= _TELEPORT_REACH_M for xy in self._teleport_xys)
 
 

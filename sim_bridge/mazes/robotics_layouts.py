@@ -75,7 +75,7 @@ TASK_CELLS: dict[str, tuple[tuple[Cell, Cell], ...]] = {
 
 @dataclass(frozen=True)
 class Robot:
-    """What the mazes of one robot share.
+    """Properties common to the mazes of one robot.
 
     Attributes:
         obs_dim: Numbers in an observation, x and y included.

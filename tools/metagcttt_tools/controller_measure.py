@@ -36,7 +36,7 @@ Prints tables and writes OUT.json, OUT.md and OUT.png, and with --gif a picture 
 
 
 class MeasureSettings(Settings):
-    """Settings of the tool."""
+    """Settings of the program."""
 
     controller: Path = Field(BUNDLED / 'ant', description='folder of the controller')
     directions: int = Field(8, ge=1, description='directions, spread evenly')
@@ -47,12 +47,12 @@ class MeasureSettings(Settings):
     episodes_per_task: int = Field(2, ge=1, description='in each maze')
     action_noise: float = Field(0.2, ge=0, description='standard deviation in the noisy rows')
     seed: int = Field(0, ge=0, description='random seed')
-    out: Path = Field(Path('out/controller'), description='files to write')
+    out: Path = Field(Path('out/controller'), description='files to write, without suffix')
     gif: Path | None = Field(None, description='also film a walk with turns, to this file')
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the tool."""
+    """Run the program."""
     settings = parse(MeasureSettings, _DESCRIPTION, 'controller measure', argv)
     from metagcttt_tools.common.plots import controller_picture, save
 

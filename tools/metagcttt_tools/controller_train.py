@@ -172,7 +172,7 @@ class ControllerTraining:
 
 
 class _Meters:
-    """What happened since the last log line."""
+    """Running figures since the last log line."""
 
     def __init__(self) -> None:
         self._rewards: list[float] = []
@@ -192,7 +192,7 @@ class _Meters:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the tool."""
+    """Run the program."""
     settings = parse(TrainControllerSettings, _DESCRIPTION, 'controller train', argv)
     use_threads(settings.threads)
     try:

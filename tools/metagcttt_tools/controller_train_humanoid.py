@@ -33,7 +33,7 @@ class TrainHumanoidSettings(Resumable):
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the tool."""
+    """Run the program."""
     settings = parse(TrainHumanoidSettings, _DESCRIPTION, 'controller train-humanoid', argv)
     use_threads(settings.threads)
     try:

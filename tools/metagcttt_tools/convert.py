@@ -37,14 +37,16 @@ _OGBENCH_NETS = {
 
 
 class ConvertSettings(Settings):
-    """Settings of the tool."""
+    """Settings of the program."""
 
     file: Annotated[Path, tyro.conf.Positional] = Field(
         Path('params.npz'), description='named arrays (npz)'
     )
     agent: AgentName = Field('gcbc', description='kind of agent')
     environment: str = Field('pointmaze-medium-v0', description='simulator the policy is for')
-    discount: float = Field(0.99, gt=0, lt=1, description='that the agent was trained with')
+    discount: float = Field(
+        0.99, gt=0, lt=1, description='discount that the agent was trained with'
+    )
     actor_loss: ActorLoss | None = Field(None, description='of GCIQL, to train it further')
     alpha: float | None = Field(None, ge=0, description='of GCIQL, to train it further')
     prefix: str = Field('', description='convert only the arrays under this name, such as init')
@@ -52,7 +54,7 @@ class ConvertSettings(Settings):
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the tool."""
+    """Run the program."""
     settings = parse(ConvertSettings, _DESCRIPTION, 'convert', argv)
     from metagcttt_core import save_checkpoint
     from metagcttt_core.training.checkpoint import has_checkpoint

@@ -32,16 +32,16 @@ _ASSETS = 'pointmaze-medium-navigate'
 
 
 class DemoSettings(Settings):
-    """Settings of the tool."""
+    """Settings of the program."""
 
     out: Path = Field(Path('out/demo'), description='folder for summary, picture and node logs')
     steps: int = Field(10, ge=1, description='test-time training steps K of the adapting arms')
-    seed: int = Field(0, ge=0, description='of starts, goals and adaptations')
+    seed: int = Field(0, ge=0, description='random seed of starts, goals and adaptations')
     timeout_s: float = Field(60.0, gt=0, description='longest wait for one goal, seconds')
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the tool."""
+    """Run the program."""
     settings = parse(DemoSettings, _DESCRIPTION, 'demo', argv)
     from metagcttt.commander import NoAnswerError
 

@@ -30,7 +30,7 @@ Records = Sequence[dict[str, Any]]
 
 
 class DiagnosticsSettings(Settings):
-    """Settings of the tool."""
+    """Settings of the program."""
 
     run: Path = Field(Path('out/meta'), description='folder of the run')
     out: Path | None = Field(None, description='folder for the pictures; RUN/diagnostics if none')
@@ -38,7 +38,7 @@ class DiagnosticsSettings(Settings):
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the tool."""
+    """Run the program."""
     settings = parse(DiagnosticsSettings, _DESCRIPTION, 'diagnostics', argv)
     from torch.utils.tensorboard import SummaryWriter
 
@@ -68,7 +68,7 @@ def main(argv: list[str] | None = None) -> None:
 
 
 def best_steps_picture(records: Records) -> Figure:
-    """How many steps the inner loops keep: shares over the run, and the histogram of k*."""
+    """Inner steps kept: shares over the run, and the histogram of k*."""
     from matplotlib.figure import Figure
 
     from metagcttt_tools.common.plots import COLORS

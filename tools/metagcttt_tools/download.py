@@ -19,7 +19,7 @@ Files that are there already are only checked; they can also be copied there by 
 
 
 class DownloadSettings(Settings):
-    """Settings of the tool."""
+    """Settings of the program."""
 
     names: tyro.conf.Positional[tuple[str, ...]] = Field(
         ('antmaze-medium-navigate-v0',),
@@ -30,7 +30,7 @@ class DownloadSettings(Settings):
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the tool."""
+    """Run the program."""
     settings = parse(DownloadSettings, _DESCRIPTION, 'download', argv)
     try:
         specs = [describe_environment(name).spec for name in settings.names]

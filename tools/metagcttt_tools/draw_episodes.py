@@ -26,7 +26,7 @@ Runs every budget on the same starts and goals; prints a table and writes OUT.pn
 
 
 class DrawSettings(Settings):
-    """Settings of the tool."""
+    """Settings of the program."""
 
     checkpoint: Path = Field(Path('out/pretrain/checkpoint'), description='the policy')
     dataset: Path = Field(
@@ -37,12 +37,12 @@ class DrawSettings(Settings):
     )
     ttt: TTTConfig = Field(TTTConfig(), description='test-time training (steps come from budgets)')
     filter: FilterConfig = FilterConfig(variant='gcttt')
-    seed: int = Field(0, ge=0, description='of starts, goals and adaptations')
-    out: Path = Field(Path('out/episodes'), description='files to write')
+    seed: int = Field(0, ge=0, description='random seed of starts, goals and adaptations')
+    out: Path = Field(Path('out/episodes'), description='files to write, without suffix')
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the tool."""
+    """Run the program."""
     settings = parse(DrawSettings, _DESCRIPTION, 'draw-episodes', argv)
     use_threads(1)
     try:

@@ -41,7 +41,7 @@ Job = tuple[str, str, int, int, int]
 
 
 class EpisodeSettings(Settings):
-    """Which episodes are driven, and how policies adapt in them."""
+    """Settings of the episodes and of the adaptation in them."""
 
     dataset: Path = Field(
         Path('data/pointmaze-medium-navigate-v0.npz'), description='dataset to adapt on (npz)'
@@ -56,13 +56,13 @@ class EpisodeSettings(Settings):
 
 
 class ProtocolSettings(Resumable, EpisodeSettings):
-    """How policies are evaluated."""
+    """Settings of an evaluation without ROS."""
 
     # The data are known by their content, wherever they are.
     may_change: ClassVar[frozenset[str]] = frozenset({'dataset', 'processes'})
 
     actor_loss: ActorLoss | None = Field(
-        None, description="to adapt GCIQL policies with; each policy's own by default"
+        None, description="actor loss to adapt GCIQL policies with; each policy's own by default"
     )
     processes: int = Field(2, ge=1, description='processes to spread the work over')
     out: Path = Field(Path('out/evaluation.json'), description='file for the results')
@@ -74,7 +74,7 @@ class ProtocolSettings(Resumable, EpisodeSettings):
 
 
 class EvaluateSettings(ProtocolSettings):
-    """Settings of the tool."""
+    """Settings of the program."""
 
     checkpoints: tuple[Path, ...] = Field(
         (Path('out/pretrain/checkpoint'),), min_length=1, description='policies to evaluate'
@@ -82,7 +82,7 @@ class EvaluateSettings(ProtocolSettings):
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the tool."""
+    """Run the program."""
     settings = parse(EvaluateSettings, _DESCRIPTION, 'evaluate', argv)
     try:
         results = evaluate(settings, settings)
@@ -218,7 +218,7 @@ def environment_of(checkpoint: Path) -> str:
 
 
 class _Worker:
-    """What a worker process loads once."""
+    """State that a worker process loads once."""
 
     settings: EvaluateSettings
     trajectory_filter: TrajectoryFilter

@@ -49,7 +49,7 @@ _FILTER_PARAMETERS = {
 
 
 class EvaluateRosSettings(EpisodeSettings):
-    """Settings of the tool."""
+    """Settings of the program."""
 
     checkpoints: tuple[Path, ...] = Field(
         (Path('out/pretrain/checkpoint'),), min_length=1, description='policies to evaluate'
@@ -62,7 +62,7 @@ class EvaluateRosSettings(EpisodeSettings):
 
     @model_validator(mode='after')
     def _must_be_parameters(self) -> EvaluateRosSettings:
-        """What policy_node has no parameter for stays at its default."""
+        """Refuse settings for which policy_node has no parameter."""
         ttt = self.ttt.model_dump(include=set(_TTT_PARAMETERS) | {'steps'})
         filtering = self.filter.model_dump(include=set(_FILTER_PARAMETERS))
         for name, given, possible in (
@@ -80,7 +80,7 @@ class EvaluateRosSettings(EpisodeSettings):
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the tool."""
+    """Run the program."""
     settings = parse(EvaluateRosSettings, _DESCRIPTION, 'evaluate-ros', argv, section='evaluate')
     from metagcttt.commander import NoAnswerError
 

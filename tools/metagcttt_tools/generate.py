@@ -48,7 +48,7 @@ class GenerateSettings(Resumable):
     place = 'output'
 
     environment: str = Field('pointmaze-medium-v0', description='Name of the maze.')
-    kind: Kind = Field('navigate', description='What the behaviour policy is after.')
+    kind: Kind = Field('navigate', description='Behaviour policy.')
     episodes: int | None = Field(
         None, ge=1, description="Training episodes; OGBench's number by default."
     )
@@ -92,7 +92,7 @@ class GenerateSettings(Resumable):
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the tool."""
+    """Run the program."""
     settings = parse(GenerateSettings, DESCRIPTION, 'generate', argv)
     try:
         _run(settings)

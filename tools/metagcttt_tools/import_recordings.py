@@ -23,7 +23,7 @@ is cut. What was left out is printed."""
 
 
 class RecordingSettings(Settings):
-    """Settings of the tool."""
+    """Settings of the program."""
 
     recordings: tuple[Path, ...] = Field(
         (), description='MCAP files; those of one split recording in order'
@@ -38,7 +38,7 @@ class RecordingSettings(Settings):
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the tool."""
+    """Run the program."""
     settings = parse(RecordingSettings, _DESCRIPTION, 'import-recordings', argv)
     from metagcttt_tools.recordings.trajectories import join_datasets, read_recordings
 
@@ -58,7 +58,7 @@ def main(argv: list[str] | None = None) -> None:
 
 
 def describe(summary: RecordingSummary) -> str:
-    """What was kept and what was not, in words."""
+    """A summary of what was kept and what was dropped, as text."""
     lines = [
         f'{summary.states} states and {summary.actions} actions became {summary.transitions} '
         f'transitions in {summary.trajectories} trajectories'

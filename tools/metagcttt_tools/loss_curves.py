@@ -37,7 +37,7 @@ _SQUARED = ('critic', 'value')  # never negative, and over orders of magnitude
 
 
 class LossCurvesSettings(Settings):
-    """Settings of the tool."""
+    """Settings of the program."""
 
     checkpoint: Path = Field(Path('out/pretrain/checkpoint'), description='policy to adapt')
     run: Path | None = Field(None, description='folder of a pre-training run to draw instead')
@@ -52,15 +52,15 @@ class LossCurvesSettings(Settings):
         TTTConfig(steps=200), description='test-time training (its rate comes from lrs)'
     )
     actor_loss: ActorLoss | None = Field(
-        None, description="to adapt a GCIQL policy with; the policy's own by default"
+        None, description='actor loss to adapt a GCIQL policy with; its own by default'
     )
     filter: FilterConfig = FilterConfig()
-    seed: int = Field(0, ge=0, description='of the start and the batches')
+    seed: int = Field(0, ge=0, description='random seed of start and batches')
     out: Path = Field(Path('out/loss_curves.json'), description='file for the results')
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the tool."""
+    """Run the program."""
     settings = parse(LossCurvesSettings, _DESCRIPTION, 'loss-curves', argv)
     from metagcttt_tools.common.plots import save
 

@@ -40,7 +40,7 @@ class MetaTrainSettings(RunSettings):
     checkpoint: Path = Field(Path('out/pretrain/checkpoint'), description='pre-trained policy')
     out: Path = Field(Path('out/meta'), description='folder of the run')
     actor_loss: ActorLoss | None = Field(
-        None, description="of a GCIQL policy from here on; the policy's own by default"
+        None, description='actor loss of a GCIQL policy from here on; its own by default'
     )
     meta: MetaConfig = MetaConfig()
     checkpoint_every: int = Field(100, ge=1, description='outer steps between checkpoints')
@@ -52,7 +52,7 @@ class MetaTrainSettings(RunSettings):
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the tool."""
+    """Run the program."""
     settings = parse(MetaTrainSettings, _DESCRIPTION, 'meta-train', argv)
     from metagcttt_core import CheckpointError
     from metagcttt_core.meta import DivergedError, TaskError

@@ -18,7 +18,7 @@ Checkpoints lose their optimiser state. The dataset keeps its first trajectories
 
 
 class PackSettings(Settings):
-    """Settings of the tool."""
+    """Settings of the program."""
 
     base: Path = Field(Path('out/pretrain/checkpoint'), description='pre-trained policy')
     meta: Path = Field(Path('out/meta/checkpoint'), description='post-trained policy')
@@ -30,7 +30,7 @@ class PackSettings(Settings):
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the tool."""
+    """Run the program."""
     settings = parse(PackSettings, _DESCRIPTION, 'pack-assets', argv)
     from metagcttt_core import CheckpointError, load_checkpoint, save_checkpoint
 

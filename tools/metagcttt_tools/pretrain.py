@@ -80,7 +80,7 @@ class PretrainSettings(RunSettings):
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the tool."""
+    """Run the program."""
     settings = parse(PretrainSettings, _DESCRIPTION, 'pretrain', argv)
     from metagcttt_core import CheckpointError
 

@@ -27,7 +27,7 @@ Rates = dict[tuple[str, float], dict[int, dict[int, float]]]
 
 
 class ReportSettings(Settings):
-    """Settings of the tool."""
+    """Settings of the program."""
 
     study: tyro.conf.Positional[Path] = Field(Path('out/study'), description='folder of the study')
     out: Path | None = Field(None, description='files to write; STUDY/report by default')
@@ -37,7 +37,7 @@ class ReportSettings(Settings):
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the tool."""
+    """Run the program."""
     settings = parse(ReportSettings, _DESCRIPTION, 'report', argv)
     from metagcttt_tools.common.plots import post_training_curves, save, success_curves
 
@@ -71,7 +71,7 @@ def _panels(adaptations: dict[str, Any]) -> dict[str, Any]:
 
 
 def read_study(folder: Path, threshold: float = 0.8) -> dict[str, Any]:
-    """What a study found.
+    """Read the results of a study.
 
     Args:
         folder: Folder of the study.

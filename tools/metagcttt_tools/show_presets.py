@@ -19,11 +19,11 @@ Any of them works with --preset NAME for generate, pretrain, meta-train and eval
 
 
 class PresetsSettings(Settings):
-    """The tool has no settings."""
+    """The program has no settings."""
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the tool."""
+    """Run the program."""
     parse(PresetsSettings, _DESCRIPTION, 'presets', argv)
     print('Pre-training:\n' + markdown_table(pretraining_rows()))
     print('\nPost-training and test-time training (Table 3):\n' + markdown_table(table3_rows()))

@@ -28,7 +28,7 @@ than --out, continues."""
 
 
 class SuccessCurveSettings(ProtocolSettings):
-    """Settings of the tool."""
+    """Settings of the program."""
 
     runs: tuple[Path, ...] = Field(
         (Path('out/pretrain'),), min_length=1, description='folders of pre-training runs'
@@ -40,7 +40,7 @@ class SuccessCurveSettings(ProtocolSettings):
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the tool."""
+    """Run the program."""
     settings = parse(SuccessCurveSettings, _DESCRIPTION, 'success-curve', argv)
     from metagcttt_tools.common.plots import save
 

@@ -33,22 +33,20 @@ _DESCRIPTION = """Run a study: pre-train a policy per seed, post-train each arm,
 
 Example: metagcttt sweep --preset pointmaze-medium-navigate-study
 Each run is a folder of OUT with its own settings, logs and checkpoints. Ctrl-C is safe: the same
-command goes on. `metagcttt report OUT` draws the figures and writes the tables."""
+command continues. `metagcttt report OUT` draws the figures and writes the tables."""
 
 
 class Arm(Settings):
     """One way to post-train."""
 
-    meta: dict[str, Any] = Field(
-        {}, description='what differs from the meta settings of the preset'
-    )
+    meta: dict[str, Any] = Field({}, description='changes to the meta settings of the preset')
     seeds: tuple[int, ...] | None = Field(
         None, description="training seeds; the study's by default"
     )
 
 
 class SweepSettings(Settings):
-    """Settings of the tool."""
+    """Settings of the program."""
 
     base: str = Field(
         'pointmaze-medium-navigate-study',
@@ -59,7 +57,7 @@ class SweepSettings(Settings):
     adaptations: Annotated[dict[str, dict[str, Any]], tyro.conf.Fixed] = Field(
         {'ttt': {}},
         min_length=1,
-        description='ways to adapt: what differs from the ttt settings of the preset',
+        description='ways to adapt: changes to the ttt settings of the preset',
     )
     curve: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = Field(
         (), description='fractions of the outer steps at which arms of all seeds are evaluated too'
@@ -80,7 +78,7 @@ class SweepSettings(Settings):
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the tool."""
+    """Run the program."""
     settings = parse(SweepSettings, _DESCRIPTION, 'sweep', argv)
     try:
         study = Study(settings)
@@ -238,7 +236,7 @@ def _run_tool(tool: str, settings: Any, stop: threading.Event) -> None:
 
 
 def is_evaluated(settings: EvaluateSettings) -> bool:
-    """Whether the results of these very settings are there."""
+    """True if the results of exactly these settings exist."""
     if not settings.out.exists():
         return False
     free = {'processes', 'out', 'resume'}

@@ -31,7 +31,7 @@ _ASSETS = 'pointmaze-medium-navigate'
 
 
 class TopViewSettings(Settings):
-    """Settings of the tool."""
+    """Settings of the program."""
 
     recording: Path = Field(Path('run.mcap'), description='MCAP file of recorder_node')
     out: Path = Field(Path('out/top_view.png'), description='picture (.png) or animation (.gif)')
@@ -39,8 +39,8 @@ class TopViewSettings(Settings):
         None, description='dataset that the robot adapted on; the committed one by default'
     )
     robot: str = Field('', description='namespace of the robot, such as /robot1')
-    goals: int = Field(5, ge=1, le=10, description='how many goals to show, the last ones')
-    frames: int = Field(60, ge=2, le=500, description='pictures of the animation per goal')
+    goals: int = Field(5, ge=1, le=10, description='number of goals to show, the last ones')
+    frames: int = Field(60, ge=2, le=500, description='frames of the animation per goal')
 
     @field_validator('out')
     @classmethod
@@ -51,7 +51,7 @@ class TopViewSettings(Settings):
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the tool."""
+    """Run the program."""
     settings = parse(TopViewSettings, _DESCRIPTION, 'top-view', argv)
     from metagcttt_tools.common.plots import save
     from metagcttt_tools.recordings.goal_views import read_goal_views

@@ -149,7 +149,7 @@ class RetrievalBenchmark(Benchmark):
 
 
 def timed(call: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
-    """What `call` returns for `arguments` and the seconds it took."""
+    """The result of `call` for `arguments`, and the seconds it took."""
     began = time.perf_counter()
     result = call(*arguments)
     return result, time.perf_counter() - began

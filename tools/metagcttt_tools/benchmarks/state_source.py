@@ -22,7 +22,7 @@ _RELIABLE = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 
 @dataclass
 class Answers:
-    """What was seen of the policy in one stretch of time; times in seconds.
+    """Observed answers of the policy over a period; times in seconds.
 
     Attributes:
         sent: When each state was published, by step.

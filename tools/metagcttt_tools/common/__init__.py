@@ -1,1 +1,1 @@
-"""What several programs share: command lines, runs, logs, presets, tables and plots."""
+"""Helpers of the programs: command lines, runs, logs, presets, tables and plots."""

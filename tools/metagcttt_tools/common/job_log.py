@@ -1,4 +1,4 @@
-"""Results of many small jobs, kept as they come so that an interrupted tool can go on."""
+"""Results of many small jobs, kept as they finish so that a program can be resumed."""
 
 import json
 from pathlib import Path

@@ -29,7 +29,7 @@ class Evaluation(Settings):
 
 
 class Manifest(Settings):
-    """What a study consists of; `metagcttt report` needs nothing else to find its results."""
+    """The contents of a study; `metagcttt report` finds all results through it."""
 
     format: Literal['metagcttt-study'] = 'metagcttt-study'
     version: Literal[1] = 1

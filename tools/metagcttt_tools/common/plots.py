@@ -95,7 +95,7 @@ def demo_picture(
 
 
 def coverage_picture(maze: MazeMap, positions: np.ndarray, bins_per_cell: int = 8) -> Figure:
-    """How often a dataset has been where; positions of shape (N, 2) in metres."""
+    """Heat map of the visits to each place; positions of shape (N, 2) in metres."""
     xmin, xmax, ymin, ymax = maze.extent
     rows, cols = (bins_per_cell * count for count in maze.walls.shape)
     counts, _, _ = np.histogram2d(

@@ -1,4 +1,4 @@
-"""How a pre-training run is doing: training and validation losses, success, speed, snapshots."""
+"""Metrics of a pre-training run: training and validation losses, success, speed."""
 
 from pathlib import Path
 import time
@@ -65,7 +65,7 @@ class Throughput:
         self._updates = 0
 
     def count(self) -> None:
-        """One more update."""
+        """Count an update."""
         self._updates += 1
 
     def rate(self) -> float:

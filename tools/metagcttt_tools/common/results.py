@@ -1,4 +1,4 @@
-"""How benchmark results are shown and kept."""
+"""Results of programs: Markdown tables and JSON reports."""
 
 from abc import ABC, abstractmethod
 import os

@@ -1,4 +1,4 @@
-"""What a long-running tool records: TensorBoard and `metrics.jsonl`."""
+"""The log of a run: TensorBoard and `metrics.jsonl`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class RunLog:
     """Numbers of a run, to TensorBoard and to the JSON-lines file `metrics.jsonl`.
 
     Attributes:
-        records: The lines of the run so far, when it goes on.
+        records: The lines logged so far by a resumed run.
     """
 
     def __init__(self, folder: Path, first_step: int) -> None:
@@ -98,7 +98,7 @@ class SilentLog(RunLog):
         """Record nothing."""
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Do nothing: no file is open."""
 
 
 def _tensorboard(folder: Path, first_step: int) -> SummaryWriter | None:

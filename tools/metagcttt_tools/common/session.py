@@ -65,7 +65,7 @@ class RunSettings(Resumable):
 
     @property
     def checkpoint_folder(self) -> Path:
-        """Where the run's checkpoint is."""
+        """Folder of the run's checkpoint."""
         return self.out / 'checkpoint'
 
 
@@ -142,12 +142,12 @@ def training_session(
 
 
 def snapshot_folder(run: Path, step: int) -> Path:
-    """Where the run in a folder keeps the policy that it had after so many steps."""
+    """The folder in which a run keeps its policy after `step` steps."""
     return run / SNAPSHOTS / f'{step:06d}'
 
 
 def left_behind(settings: RunSettings) -> str:
-    """What there is to go on from after a failure, in words."""
+    """What a failed run can be resumed from, as a phrase."""
     from metagcttt_core.training.checkpoint import steps_done
 
     step = steps_done(settings.checkpoint_folder)

@@ -1,4 +1,4 @@
-"""How the humanoid learns to walk: stages of growing difficulty, many humanoids side by side."""
+"""Training of the humanoid controller: stages of growing difficulty, many humanoids at once."""
 
 from collections.abc import Callable
 import json
@@ -229,7 +229,7 @@ def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, np.ndarray]:
 
 
 class _Meters:
-    """What happened since the last log."""
+    """Running figures since the last log line."""
 
     def __init__(self) -> None:
         self._clear()

@@ -1,4 +1,4 @@
-"""How the humanoid learns to walk, in numbers."""
+"""Hyper-parameters of the humanoid controller."""
 
 from dataclasses import dataclass
 import math

@@ -19,7 +19,7 @@ _EVERY = QoSProfile(
 
 @dataclass
 class GoalOutcome:
-    """What became of one goal.
+    """The outcome of one goal.
 
     Attributes:
         success: Whether the goal was reached.

@@ -1,4 +1,4 @@
-"""What a recording says about each goal: where the robot went and what was retrieved for it."""
+"""Goals in a recording: the robot's path and the data retrieved for each."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -34,7 +34,7 @@ class Recorded:
 
 @dataclass(frozen=True)
 class RecordedMessages:
-    """What was asked for of one file.
+    """The requested messages of one file.
 
     Attributes:
         messages: In the order of publication.

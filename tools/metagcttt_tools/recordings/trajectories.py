@@ -18,7 +18,7 @@ ACTION = 'metagcttt_interfaces/msg/ActionCommand'
 
 @dataclass(frozen=True)
 class RecordingSummary:
-    """What became of the recorded messages.
+    """Counts of kept and dropped messages.
 
     Attributes:
         states: Recorded states.
@@ -92,7 +92,7 @@ class _Robot:
         self._rows = []
 
     def _break(self, last: Any, state: Any) -> str:
-        """Why no transition leads from one state to another of the same episode; empty if fine."""
+        """The reason why two states of an episode form no transition; empty if they do."""
         if state.episode_id != last.episode_id:
             return ''
         if state.step <= last.step:
