@@ -44,7 +44,9 @@ def post_train(
         cuda_graphs: On a GPU, replay captured inner steps where tasks are adapted one by one.
 
     Returns:
-        The post-trained policy theta.
+        The post-trained policy theta. Its `optimizer_state` is still that of pre-training: inner
+        loops begin with a fresh one (the paper leaves it open), and the outer Adam of TT-FOMAML is
+        another optimiser.
 
     Raises:
         DivergedError: When a loss or a weight is no longer finite. `run` keeps the checkpoint
