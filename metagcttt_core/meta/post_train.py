@@ -62,7 +62,7 @@ def post_train(
     outer_optimizer = None
     if config.algorithm in GRADIENT_UPDATES:
         parameters = base.trained_parameters(actor_only=config.actor_only)
-        outer_optimizer = make_optimizer('adam', parameters, config.meta_lr)
+        outer_optimizer = make_optimizer('adam', parameters, config.outer_lr)
     numbers = own_tasks(config.meta_batch_size)
     inner_loops = make_inner_loops(base, config, cuda_graphs=cuda_graphs)
 

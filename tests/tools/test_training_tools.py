@@ -12,6 +12,7 @@ import time
 import metagcttt_core
 from metagcttt_core import adapt, load_checkpoint, save_checkpoint
 from metagcttt_tools import evaluate, meta_train, pack_assets, pretrain
+from metagcttt_tools.common.cli import parse
 import numpy as np
 import pytest
 from tests.core.builders import maze_walks
@@ -99,6 +100,25 @@ def test_meta_train_changes_the_policy_and_keeps_its_history(
     last = json.loads((tmp_path / 'metrics.jsonl').read_text().splitlines()[-1])
     assert last['step'] == 4
     assert last['task/support_transitions'] > 0
+
+
+@pytest.mark.parametrize(
+    ('algorithm', 'rate'), [('continual', 1.0), ('fomaml', 3e-4), ('maml', 3e-4), ('reptile', 0.1)]
+)
+def test_another_algorithm_over_the_preset_of_the_readme_has_a_rate_of_its_own(algorithm, rate):
+    flags = ['--preset', 'pointmaze-medium-navigate-cpu', '--meta.algorithm', algorithm]
+    settings = parse(meta_train.MetaTrainSettings, '', 'meta-train', flags)
+    assert (settings.meta.algorithm, settings.meta.outer_lr) == (algorithm, rate)
+    assert settings.decisive()['meta.meta_lr'] == rate
+
+
+def test_merging_coefficient_is_refused_as_a_rate_of_adam(tmp_path, capsys):
+    preset = tmp_path / 'mine.yaml'
+    preset.write_text('meta_train: {meta: {algorithm: reptile, meta_lr: 0.1}}')
+    with pytest.raises(SystemExit, match='2'):
+        meta_train.main(['--preset', str(preset), '--meta.algorithm', 'fomaml'])
+    printed = ' '.join(capsys.readouterr().err.split())
+    assert 'learning rate of the outer Adam of fomaml and must be at most 0.01' in printed
 
 
 @pytest.mark.slow
