@@ -14,6 +14,7 @@ from metagcttt_core.adaptation.result import Adaptation, OnStep
 from metagcttt_core.agents.agent import Agent
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.retrieval.support import SupportSet
+from metagcttt_core.training.optimizers import pretrained_state
 
 
 def adapt(
@@ -24,7 +25,6 @@ def adapt(
     config: TTTConfig,
     seed: int = 0,
     *,
-    optimizer_state: dict | None = None,
     should_stop: Callable[[], bool] | None = None,
     on_step: OnStep | None = None,
 ) -> Adaptation:
@@ -37,8 +37,6 @@ def adapt(
         goal: (obs_dim,) the query's goal g.
         config: K, learning rate, batch size and the rest.
         seed: Of the batches and the held-out split.
-        optimizer_state: The pre-trained optimiser state, for
-            `config.optimizer_state='pretrained'`.
         should_stop: Asked before every gradient step; true cancels.
         on_step: Called after every gradient step, with the losses by part.
 
@@ -49,10 +47,14 @@ def adapt(
 
     Raises:
         AdaptationCancelled: When `should_stop` returned true.
-        ValueError: If agent, dataset and goal do not fit together.
+        ValueError: If agent, dataset and goal do not fit together, or the agent has no optimiser
+            state to begin with.
     """
     began = time.perf_counter()
-    _check(agent, dataset, goal, config, optimizer_state)
+    _check(agent, dataset, goal)
+    state = None
+    if config.optimizer_state == 'pretrained':
+        state = pretrained_state(agent, actor_only=config.actor_only)
 
     def ended(result: Adaptation) -> Adaptation:
         return replace(result, support=support, seconds=time.perf_counter() - began)
@@ -90,7 +92,6 @@ def adapt(
         if not len(test_batches.rows):
             return base('the filtered dataset is too small to hold out a test split')
         test_batch = test_batches.all(rng)
-    state = optimizer_state if config.optimizer_state == 'pretrained' else None
     result = run_inner_loop(
         agent,
         train_batches.steps(config.steps, config.batch_size, rng),
@@ -109,13 +110,7 @@ def adapt(
     return ended(result)
 
 
-def _check(
-    agent: Agent,
-    dataset: TrajectoryDataset,
-    goal: np.ndarray,
-    config: TTTConfig,
-    optimizer_state: dict | None,
-) -> None:
+def _check(agent: Agent, dataset: TrajectoryDataset, goal: np.ndarray) -> None:
     for name in ('obs_dim', 'act_dim'):
         if getattr(agent, name) != getattr(dataset, name):
             raise ValueError(
@@ -126,5 +121,3 @@ def _check(
         raise ValueError(f'goal must have shape ({agent.obs_dim},), got {np.shape(goal)}')
     if not np.isfinite(goal).all():
         raise ValueError(f'goal holds a non-finite value: {goal}')
-    if config.optimizer_state == 'pretrained' and optimizer_state is None:
-        raise ValueError('optimizer_state=pretrained needs the optimiser state of pre-training')

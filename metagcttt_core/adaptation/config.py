@@ -1,8 +1,8 @@
 """Settings of the inner loop, at test time and in meta-post-training."""
 
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from metagcttt_core.config.settings import Settings
 from metagcttt_core.training.config import OptimizerName
@@ -25,15 +25,38 @@ class InnerLoopConfig(Settings):
     )
 
 
-class TTTConfig(InnerLoopConfig):
-    """K gradient steps on the support set of a query (paper, section 3.2)."""
+class TTTLoopConfig(InnerLoopConfig):
+    """The inner loop at test time, without K and the learning rate."""
 
-    steps: int = Field(10, ge=0, description='gradient steps K; 0 acts with the base policy')
-    lr: float = Field(3e-4, gt=0, description='inner learning rate alpha')
     optimizer_state: Literal['fresh', 'pretrained'] = Field(
         'fresh', description='Adam moments and step count to begin with'
     )
     early_stopping: bool = Field(False, description='hold out a test split and keep the best step')
+
+    @model_validator(mode='after')
+    def _state_is_of_adam(self) -> Self:
+        if self.optimizer_state == 'pretrained' and self.optimizer != 'adam':
+            raise ValueError(
+                'optimizer_state=pretrained is the state of Adam, by which policies are '
+                f'pre-trained, but optimizer is {self.optimizer}'
+            )
+        return self
+
+
+class TTTSettings(TTTLoopConfig):
+    """Test-time training but for its budget K, for programs that run through budgets."""
+
+    lr: float = Field(3e-4, gt=0, description='inner learning rate alpha')
     horizon: int | None = Field(
         None, ge=1, description='environment steps after which to adapt again; never by default'
     )
+
+    def with_steps(self, steps: int) -> 'TTTConfig':
+        """The settings with a budget of K gradient steps."""
+        return TTTConfig(**self.model_dump(), steps=steps)
+
+
+class TTTConfig(TTTSettings):
+    """K gradient steps on the support set of a query (paper, section 3.2)."""
+
+    steps: int = Field(10, ge=0, description='gradient steps K; 0 acts with the base policy')

@@ -2,12 +2,11 @@
 
 from collections.abc import Callable, Iterable, Sequence
 import math
-from typing import Any
 
 import torch
 
 from metagcttt_core.adaptation.result import Adaptation, AdaptationCancelled, OnStep
-from metagcttt_core.agents.agent import Agent, TensorBatch
+from metagcttt_core.agents.agent import Agent, OptimizerState, TensorBatch
 from metagcttt_core.training.config import OptimizerName
 from metagcttt_core.training.optimizers import make_optimizer
 from metagcttt_core.training.step import gradient_step
@@ -19,7 +18,7 @@ def run_inner_loop(
     *,
     lr: float,
     optimizer: OptimizerName = 'adam',
-    optimizer_state: dict[int, dict[str, Any]] | None = None,
+    optimizer_state: OptimizerState | None = None,
     test_batch: TensorBatch | None = None,
     actor_only: bool = False,
     should_stop: Callable[[], bool] | None = None,

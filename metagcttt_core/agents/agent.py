@@ -15,6 +15,8 @@ from metagcttt_core.agents.config import AgentSettings
 from metagcttt_core.agents.networks import MLP
 
 TensorBatch = dict[str, Tensor]
+OptimizerState = dict[int, dict[str, Tensor]]
+"""Moments and step count by name, for each trained parameter by its number."""
 _HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
 
 
@@ -25,6 +27,10 @@ class Agent(nn.Module, ABC):
         obs_dim, act_dim: Widths of an observation (and goal) and of an action.
         settings: The agent's settings, defaults resolved.
         metadata: Facts that travel with the weights (`environment`, `history`, ...).
+        optimizer_state: Adam's at the end of pre-training, by number in `trained_parameters()`,
+            None where it is not known. It travels with the weights, whatever is done to them, and
+            is never changed; `TTTConfig(optimizer_state='pretrained')` begins with it.
+        origin: Name for error messages: the checkpoint that it was loaded from.
     """
 
     name: ClassVar[str]
@@ -42,6 +48,8 @@ class Agent(nn.Module, ABC):
         self.act_dim = act_dim
         self.settings = settings
         self.metadata: dict[str, Any] = {}
+        self.optimizer_state: OptimizerState | None = None
+        self.origin = 'the agent'
         self.actor = MLP(
             2 * obs_dim,
             settings.hidden,
@@ -86,8 +94,9 @@ class Agent(nn.Module, ABC):
         return digest.hexdigest()
 
     def clone(self) -> Self:
-        """An independent copy with equal weights."""
-        return copy.deepcopy(self)
+        """An independent copy with equal weights, and the same optimiser state."""
+        # Twice as large as the weights and never changed: shared instead of copied.
+        return copy.deepcopy(self, {id(self.optimizer_state): self.optimizer_state})
 
     def log_prob(
         self, observations: Tensor, goals: Tensor, actions: Tensor

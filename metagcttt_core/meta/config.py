@@ -1,13 +1,27 @@
 """Settings of meta-post-training."""
 
-from typing import Literal
+from typing import Literal, NamedTuple, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from metagcttt_core.adaptation.config import InnerLoopConfig
 from metagcttt_core.retrieval.config import FilterConfig
 
 Algorithm = Literal['continual', 'fomaml', 'reptile', 'maml']
+
+
+class _MetaLR(NamedTuple):
+    meaning: str
+    default: float
+    largest: float
+
+
+_OUTER_ADAM = _MetaLR('learning rate of the outer Adam', 3e-4, 0.01)
+_META_LR = {
+    'fomaml': _OUTER_ADAM,
+    'maml': _OUTER_ADAM,
+    'reptile': _MetaLR('merging coefficient', 0.1, 1.0),  # the paper's most frequent one
+}
 
 
 class MetaConfig(InnerLoopConfig):
@@ -17,10 +31,36 @@ class MetaConfig(InnerLoopConfig):
     outer_steps: int = Field(50_000, ge=1, description='outer steps N')
     inner_steps: int = Field(100, ge=1, description='inner steps K, the most with early stopping')
     inner_lr: float = Field(3e-5, gt=0, description='inner learning rate alpha')
-    meta_lr: float = Field(
-        3e-4,
+    meta_lr: float | None = Field(
+        None,
         gt=0,
-        description='beta: rate of the outer Adam (fomaml, maml), merging coefficient (reptile)',
+        description='beta: outer learning rate (fomaml, maml; 3e-4 by default) or merging '
+        'coefficient (reptile; 0.1)',
     )
     meta_batch_size: int = Field(1, ge=1, description='tasks per outer step B')
     filter: FilterConfig = FilterConfig()
+
+    @model_validator(mode='after')
+    def _meta_lr_fits_the_algorithm(self) -> Self:
+        """What is a good merging coefficient ruins a policy as the rate of the outer Adam."""
+        if self.meta_lr is None:
+            return self
+        if self.algorithm == 'continual':
+            raise ValueError(
+                'meta_lr has no effect on continual, which takes the mean of the adapted weights; '
+                f'leave it out, got {self.meta_lr:g}'
+            )
+        what, _, largest = _META_LR[self.algorithm]
+        if self.meta_lr > largest:
+            raise ValueError(
+                f'meta_lr is the {what} of {self.algorithm} and must be at most {largest:g}, '
+                f'got {self.meta_lr:g}'
+            )
+        return self
+
+    @property
+    def outer_lr(self) -> float:
+        """`meta_lr`, or the algorithm's default; 1 for CONTINUAL-TTT, which merges fully."""
+        if self.algorithm == 'continual':
+            return 1.0
+        return _META_LR[self.algorithm].default if self.meta_lr is None else self.meta_lr

@@ -44,7 +44,9 @@ def post_train(
         cuda_graphs: On a GPU, replay captured inner steps where tasks are adapted one by one.
 
     Returns:
-        The post-trained policy theta.
+        The post-trained policy theta. Its `optimizer_state` is still that of pre-training: inner
+        loops begin with a fresh one (the paper leaves it open), and the outer Adam of TT-FOMAML is
+        another optimiser.
 
     Raises:
         DivergedError: When a loss or a weight is no longer finite. `run` keeps the checkpoint
@@ -60,7 +62,7 @@ def post_train(
     outer_optimizer = None
     if config.algorithm in GRADIENT_UPDATES:
         parameters = base.trained_parameters(actor_only=config.actor_only)
-        outer_optimizer = make_optimizer('adam', parameters, config.meta_lr)
+        outer_optimizer = make_optimizer('adam', parameters, config.outer_lr)
     numbers = own_tasks(config.meta_batch_size)
     inner_loops = make_inner_loops(base, config, cuda_graphs=cuda_graphs)
 

@@ -40,7 +40,7 @@ def reptile(
 ) -> None:
     """TT-REPTILE: theta <- theta + beta (mean of the adapted weights - theta)."""
     for weight, mean in zip(base.state_dict().values(), _mean_weights(experts), strict=True):
-        weight.add_(config.meta_lr * (mean - weight))
+        weight.add_(config.outer_lr * (mean - weight))
 
 
 def fomaml(

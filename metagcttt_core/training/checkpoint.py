@@ -15,12 +15,13 @@ import torch
 from torch import Tensor
 
 from metagcttt_core.agents import AGENTS
-from metagcttt_core.agents.agent import Agent
+from metagcttt_core.agents.agent import Agent, OptimizerState
 from metagcttt_core.config.settings import error_lines, Settings
 from metagcttt_core.files import atomic_write, write_json
 
 FORMAT_VERSION = 1
 _INDEX = 'checkpoint.json'
+_PRETRAINING = 'pretrain'  # the stage
 
 
 class CheckpointError(ValueError):
@@ -35,13 +36,13 @@ class TrainingState:
         stage: `pretrain` or `post_train`.
         step: Steps done.
         settings: The run's settings, to refuse going on with others.
-        optimizer: The optimiser's state by number of the parameter.
+        optimizer: The state of the run's own optimiser.
     """
 
     stage: str
     step: int
     settings: dict[str, Any]
-    optimizer: dict[int, dict[str, Tensor]] = field(default_factory=dict)
+    optimizer: OptimizerState = field(default_factory=dict)
 
 
 class _Training(Settings):
@@ -68,24 +69,29 @@ def save_checkpoint(agent: Agent, path: str | Path, training: TrainingState | No
     The weights go to a file named by their hash, then `checkpoint.json`, which names that file, is
     replaced. A crash in between leaves the previous checkpoint whole.
 
+    Two optimisers may have a state in there: the run's own (`optimizer.`) and, with the agent,
+    that of pre-training (`pretraining.`). In a pre-training run they are one, saved once.
+
     Args:
-        agent: What to save, with its `metadata`.
+        agent: What to save, with its `metadata` and `optimizer_state`.
         path: The folder; made if missing.
         training: The state of the run, to be resumed later.
 
     Raises:
-        CheckpointError: If a weight is not finite; such a checkpoint could not be loaded.
+        CheckpointError: If a number is not finite; such a checkpoint could not be loaded.
         OSError: If the folder cannot be written.
         After either, the previous checkpoint is still there.
     """
     folder = Path(path)
-    for name, tensor in agent.state_dict().items():
-        if not torch.isfinite(tensor).all():
-            raise CheckpointError(f'{folder}: not saved, weight {name} holds a non-finite value')
     tensors = {f'agent.{name}': tensor for name, tensor in agent.state_dict().items()}
     if training is not None:
-        for number, state in training.optimizer.items():
-            tensors |= {f'optimizer.{number}.{name}': tensor for name, tensor in state.items()}
+        tensors |= _named('optimizer', training.optimizer)
+    if training is None or training.stage != _PRETRAINING:
+        tensors |= _named('pretraining', agent.optimizer_state or {})
+    for name, tensor in tensors.items():
+        if not torch.isfinite(tensor).all():
+            what = name if (weight := name.removeprefix('agent.')) == name else f'weight {weight}'
+            raise CheckpointError(f'{folder}: not saved, {what} holds a non-finite value')
     content = safetensors.torch.save({name: t.contiguous().cpu() for name, t in tensors.items()})
     weights = f'weights-{hashlib.sha256(content).hexdigest()[:16]}.safetensors'
     index = _Index(
@@ -113,7 +119,7 @@ def load_checkpoint(
     environment: str | None = None,
     changes: Mapping[str, Any] | None = None,
 ) -> Agent:
-    """The agent saved in the folder `path`.
+    """The agent saved in the folder `path`, with its metadata and optimiser state.
 
     Args:
         path: The folder, or its `checkpoint.json`.
@@ -163,6 +169,11 @@ def load_checkpoint(
             raise CheckpointError(f'{folder}: weight {name} holds a non-finite value')
     agent.load_state_dict(saved)
     agent.metadata = dict(index.metadata)
+    own_run = index.training is not None and index.training.stage == _PRETRAINING
+    agent.optimizer_state = (
+        _state(folder, 'optimizer' if own_run else 'pretraining', tensors) or None
+    )
+    agent.origin = str(folder)
     return agent
 
 
@@ -184,16 +195,11 @@ def load_training_state(path: str | Path) -> TrainingState:
     index = _read_index(folder)
     if index.training is None:
         raise CheckpointError(f'{folder}: was saved without a training state, cannot be resumed')
-    optimizer: dict[int, dict[str, Tensor]] = {}
-    for name, tensor in _read_tensors(folder, index).items():
-        if name.startswith('agent.'):
-            continue
-        match = re.fullmatch(r'optimizer\.(\d+)\.(\w+)', name)
-        if match is None:
+    tensors = _read_tensors(folder, index)
+    for name in tensors:
+        if not name.startswith(('agent.', 'optimizer.', 'pretraining.')):
             raise CheckpointError(f'{folder}: unknown tensor {name}')
-        if not torch.isfinite(tensor).all():
-            raise CheckpointError(f'{folder}: {name} holds a non-finite value')
-        optimizer.setdefault(int(match[1]), {})[match[2]] = tensor
+    optimizer = _state(folder, 'optimizer', tensors)
     training = index.training
     return TrainingState(training.stage, training.step, training.settings, optimizer)
 
@@ -201,6 +207,29 @@ def load_training_state(path: str | Path) -> TrainingState:
 def has_checkpoint(path: str | Path) -> bool:
     """Whether the folder `path` holds a checkpoint."""
     return (Path(path) / _INDEX).is_file()
+
+
+def _named(group: str, optimizer: OptimizerState) -> dict[str, Tensor]:
+    return {
+        f'{group}.{number}.{name}': tensor
+        for number, state in optimizer.items()
+        for name, tensor in state.items()
+    }
+
+
+def _state(folder: Path, group: str, tensors: Mapping[str, Tensor]) -> OptimizerState:
+    """The inverse of `_named`; empty where there is none."""
+    optimizer: OptimizerState = {}
+    for name, tensor in tensors.items():
+        if not name.startswith(f'{group}.'):
+            continue
+        match = re.fullmatch(rf'{group}\.(\d+)\.(\w+)', name)
+        if match is None:
+            raise CheckpointError(f'{folder}: unknown tensor {name}')
+        if not torch.isfinite(tensor).all():
+            raise CheckpointError(f'{folder}: {name} holds a non-finite value')
+        optimizer.setdefault(int(match[1]), {})[match[2]] = tensor
+    return optimizer
 
 
 def _folder(path: str | Path) -> Path:

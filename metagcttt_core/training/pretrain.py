@@ -41,7 +41,7 @@ def pretrain(
             tensors) and the agent after it.
 
     Returns:
-        The trained copy.
+        The trained copy, with the optimiser's state.
     """
     agent = agent.clone()
     run = run or TrainingRun('pretrain', {})
@@ -54,6 +54,7 @@ def pretrain(
         loss, parts = gradient_step(
             agent, optimizer, parameters, agent.tensors(batch), losses=losses
         )
+        agent.optimizer_state = optimizer.state_dict()['state']
         on_step(step + 1, {'loss': loss, **parts}, agent)
         run.step_done(agent, optimizer, step + 1, config.steps)
     return agent

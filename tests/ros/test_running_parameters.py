@@ -12,6 +12,7 @@ from metagcttt_interfaces.msg import ActionCommand, MazeState
 import pytest
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+import torch
 
 from tests.ros.fault_rig import FaultRig, WARN
 from tests.ros.goal_rig import FREE, GoalRig
@@ -39,6 +40,14 @@ def test_no_parameter_is_left_out() -> None:
 @pytest.fixture
 def critic_files(tmp_path: Path, dataset_file: Path) -> dict[str, str]:
     agent = make_agent('gciql', obs_dim=2, act_dim=2, hidden=(16, 16))
+    agent.optimizer_state = {
+        number: {
+            'step': torch.tensor(100.0),
+            'exp_avg': torch.full_like(weight, 0.01),
+            'exp_avg_sq': torch.full_like(weight, 0.01),
+        }
+        for number, weight in enumerate(agent.trained_parameters())
+    }
     save_checkpoint(agent, tmp_path / 'gciql')
     return {'checkpoint': str(tmp_path / 'gciql'), 'dataset': str(dataset_file)}
 
@@ -50,6 +59,7 @@ def critic_files(tmp_path: Path, dataset_file: Path) -> dict[str, str]:
         ('adapt_lr', 0.03, 'train_losses'),
         ('adapt_batch_size', 16, 'train_losses'),
         ('actor_only', True, 'train_losses'),
+        ('optimizer_state', 'pretrained', 'train_losses'),
         ('early_stopping', False, 'test_losses'),
         ('test_fraction', 0.5, 'test_losses'),
     ],
@@ -66,6 +76,17 @@ def test_next_adaptation_is_another_one(
     change(rig.node, **{name: value})
     rig.goal(3)
     assert getattr(rig.report(3), shown_by) != getattr(first, shown_by)
+
+
+def test_optimizer_state_that_the_checkpoint_lacks_is_refused(
+    graph: Graph, tmp_path: Path, dataset_file: Path
+) -> None:
+    save_checkpoint(make_agent('gcbc', obs_dim=2, act_dim=2, hidden=(16,)), tmp_path / 'bare')
+    rig = PolicyRig(graph, {'checkpoint': str(tmp_path / 'bare'), 'dataset': str(dataset_file)})
+    [result] = rig.node.set_parameters([Parameter('optimizer_state', value='pretrained')])
+    assert not result.successful
+    assert 'bare: has no optimiser state of pre-training' in result.reason
+    assert rig.node.get_parameter('optimizer_state').value == 'fresh'
 
 
 def test_next_goal_is_adapted_to_anew_after_the_horizon(

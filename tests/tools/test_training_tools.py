@@ -1,5 +1,6 @@
 """Pre-training, post-training and evaluation as a user runs them, in miniature."""
 
+from concurrent.futures import ThreadPoolExecutor
 import json
 import os
 from pathlib import Path
@@ -8,8 +9,10 @@ import subprocess
 import sys
 import time
 
-from metagcttt_core import load_checkpoint
-from metagcttt_tools import evaluate, meta_train, pretrain
+import metagcttt_core
+from metagcttt_core import adapt, load_checkpoint, save_checkpoint
+from metagcttt_tools import evaluate, meta_train, pack_assets, pretrain
+from metagcttt_tools.common.cli import parse
 import numpy as np
 import pytest
 from tests.core.builders import maze_walks
@@ -100,6 +103,25 @@ def test_meta_train_changes_the_policy_and_keeps_its_history(
     assert last['task/support_transitions'] > 0
 
 
+@pytest.mark.parametrize(
+    ('algorithm', 'rate'), [('continual', 1.0), ('fomaml', 3e-4), ('maml', 3e-4), ('reptile', 0.1)]
+)
+def test_another_algorithm_over_the_preset_of_the_readme_has_a_rate_of_its_own(algorithm, rate):
+    flags = ['--preset', 'pointmaze-medium-navigate-cpu', '--meta.algorithm', algorithm]
+    settings = parse(meta_train.MetaTrainSettings, '', 'meta-train', flags)
+    assert (settings.meta.algorithm, settings.meta.outer_lr) == (algorithm, rate)
+    assert settings.decisive()['meta.meta_lr'] == rate
+
+
+def test_merging_coefficient_is_refused_as_a_rate_of_adam(tmp_path, capsys):
+    preset = tmp_path / 'mine.yaml'
+    preset.write_text('meta_train: {meta: {algorithm: reptile, meta_lr: 0.1}}')
+    with pytest.raises(SystemExit, match='2'):
+        meta_train.main(['--preset', str(preset), '--meta.algorithm', 'fomaml'])
+    printed = ' '.join(capsys.readouterr().err.split())
+    assert 'learning rate of the outer Adam of fomaml and must be at most 0.01' in printed
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGINT])
 def test_interrupted_run_resumes_to_the_same_bits(number, dataset_path, base, tmp_path):
@@ -146,6 +168,64 @@ def test_evaluate_writes_success_by_budget_and_seed(dataset_path, base, tmp_path
         assert sorted(point['per_task']) == ['1', '2', '3', '4', '5']
         assert point['success'] == pytest.approx(np.mean(point['per_seed']))
     assert '| K = 0 | K = 1 | AUC |' in squeezed(capsys.readouterr().out)
+
+
+@pytest.mark.mujoco
+def test_evaluate_begins_with_the_optimizer_state_of_pretraining(
+    dataset_path, base, tmp_path, capsys, monkeypatch
+):
+    """In this process, to see the agents that act."""
+    post_trained = tmp_path / 'meta' / 'checkpoint'
+    meta_train.main(meta_arguments(dataset_path, base, post_trained.parent, steps=2))
+    started = []
+
+    def success(agent, simulator, ttt, trajectory_filter, seed, **_):
+        data = trajectory_filter.dataset
+        support = trajectory_filter.query(data.observations[0], data.observations[30])
+        adapted = [
+            adapt(agent, data, support, data.observations[30], config).agent
+            for config in (ttt, ttt.model_copy(update={'optimizer_state': 'fresh'}))
+        ]
+        started.append((adapted[0].fingerprint(), adapted[1].fingerprint()))
+        return {'mean': 0.5}
+
+    monkeypatch.setattr(evaluate, 'ProcessPoolExecutor', InThisProcess)
+    monkeypatch.setattr(metagcttt_core, 'evaluate_success', success)
+    files = ['--dataset', str(dataset_path), '--checkpoints', str(base), str(post_trained)]
+    steps = ['--budgets', '2', '--seeds', '0', '--ttt.batch-size', '16', '--filter.epsilon', '9']
+    arguments = [*files, *steps, '--out', str(tmp_path / 'evaluation.json')]
+    evaluate.main([*arguments, '--ttt.optimizer-state', 'pretrained'])
+    assert len(started) == 2 * 5
+    assert all(pretrained != fresh for pretrained, fresh in started)
+    packed = tmp_path / 'packed'
+    save_checkpoint(without_optimizer_state(base), packed)
+    arguments[arguments.index(str(post_trained))] = str(packed)
+    with pytest.raises(SystemExit, match='2'):
+        evaluate.main([*arguments, '--ttt.optimizer-state', 'pretrained'])
+    assert f'{packed}: has no optimiser state of pre-training' in capsys.readouterr().err
+    assert len(started) == 2 * 5
+
+
+def without_optimizer_state(folder):
+    agent = load_checkpoint(folder)
+    agent.optimizer_state = None
+    return agent
+
+
+class InThisProcess(ThreadPoolExecutor):
+    """Runs the jobs of an evaluation one after the other, where the test can watch them."""
+
+    def __init__(self, processes, *, mp_context, initializer, initargs):
+        super().__init__(1, initializer=initializer, initargs=initargs)
+
+
+@pytest.mark.parametrize('kept', [False, True])
+def test_packed_policies_have_their_optimizer_state_when_asked(kept, dataset_path, base, tmp_path):
+    arguments = ['--base', str(base), '--meta', str(base), '--dataset', str(dataset_path)]
+    arguments += ['--out', str(tmp_path / 'assets')]
+    pack_assets.main([*arguments, '--optimizer-state'] if kept else arguments)
+    agent = load_checkpoint(tmp_path / 'assets' / 'base')
+    assert (agent.optimizer_state is not None) == kept
 
 
 @pytest.mark.mujoco

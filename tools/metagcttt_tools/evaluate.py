@@ -175,10 +175,15 @@ def finished_jobs(out: Path) -> Path:
 def _run_jobs(settings: EvaluateSettings, program: Resumable, jobs: list[Job]) -> dict[Job, float]:
     """Success rate of every job; jobs run in separate processes and are kept as they finish."""
     from metagcttt_core import load_checkpoint
+    from metagcttt_core.training.optimizers import pretrained_state
 
+    policies = [load_checkpoint(path) for path in settings.checkpoints]
+    if settings.ttt.optimizer_state == 'pretrained':
+        for policy in policies:
+            pretrained_state(policy)  # refuses those without one before anything runs
     decisive = settings.decisive()
     decisive['dataset'] = TrajectoryDataset.load(settings.dataset).fingerprint
-    decisive['policies'] = [load_checkpoint(path).fingerprint() for path in settings.checkpoints]
+    decisive['policies'] = [policy.fingerprint() for policy in policies]
     log: JobLog[Job] = JobLog(
         finished_jobs(settings.out),
         {'decisive': decisive, 'program': program.model_dump(mode='json')},

@@ -39,6 +39,7 @@ _TTT_PARAMETERS = {
     'early_stopping': 'early_stopping',
     'test_fraction': 'test_fraction',
     'actor_only': 'actor_only',
+    'optimizer_state': 'optimizer_state',
     'horizon': 'horizon',
 }
 _FILTER_PARAMETERS = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 from metagcttt_core import DatasetError, MetaConfig, TrajectoryDataset
 from metagcttt_core.agents.config import ActorLoss
@@ -49,6 +49,10 @@ class MetaTrainSettings(RunSettings):
     )
     cuda_graphs: bool = Field(True, description='on a GPU, replay captured inner steps')
     log_every: int = Field(10, ge=1, description='outer steps between log lines (means over them)')
+
+    def decisive(self) -> dict[str, Any]:
+        """The settings that decide the result, with the outer rate that the algorithm takes."""
+        return super().decisive() | {'meta.meta_lr': self.meta.outer_lr}
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -13,8 +13,10 @@ from metagcttt_tools.common.cli import fail, parse
 _DESCRIPTION = """Pack trained policies and part of their dataset into the assets of the demo.
 
 Example: metagcttt pack-assets --preset pointmaze-medium-navigate-cpu
-Checkpoints lose their optimiser state. The dataset keeps its first trajectories, in half precision
-(1.6 cm at 20 m) and without the simulator's own state, to be small enough for a repository."""
+Checkpoints lose their optimiser state, which is twice as large as the weights, unless
+--optimizer-state keeps that of pre-training. The dataset keeps its first trajectories, in half
+precision (1.6 cm at 20 m) and without the simulator's own state, to be small enough for a
+repository."""
 
 
 class PackSettings(Settings):
@@ -26,6 +28,9 @@ class PackSettings(Settings):
         Path('data/pointmaze-medium-navigate-v0.npz'), description='their dataset (npz)'
     )
     episodes: int = Field(500, ge=1, description='trajectories to keep')
+    optimizer_state: bool = Field(
+        False, description='keep the optimiser state of pre-training, for test-time training'
+    )
     out: Path = Field(Path('assets/pointmaze-medium-navigate'), description='folder to write')
 
 
@@ -36,7 +41,10 @@ def main(argv: list[str] | None = None) -> None:
 
     try:
         for name in ('base', 'meta'):
-            save_checkpoint(load_checkpoint(getattr(settings, name)), settings.out / name)
+            agent = load_checkpoint(getattr(settings, name))
+            if not settings.optimizer_state:
+                agent.optimizer_state = None
+            save_checkpoint(agent, settings.out / name)
         pack_dataset(TrajectoryDataset.load(settings.dataset), settings)
     except (DatasetError, CheckpointError) as error:
         fail(str(error))

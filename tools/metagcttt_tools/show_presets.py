@@ -5,7 +5,7 @@ from typing import Any
 from metagcttt_core.config import Settings
 
 from metagcttt_tools.common.cli import parse
-from metagcttt_tools.common.paper import paper_presets
+from metagcttt_tools.common.paper import paper_presets, table3
 from metagcttt_tools.common.presets import load_preset
 from metagcttt_tools.common.results import markdown_table
 from metagcttt_tools.evaluate import EvaluateSettings
@@ -50,19 +50,22 @@ def pretraining_rows() -> list[dict[str, Any]]:
 
 
 def table3_rows() -> list[dict[str, Any]]:
-    """Each row of the paper's Table 3, as the tools would run it."""
+    """Each row of the paper's Table 3, as the tools would run it.
+
+    CONTINUAL-TTT has a meta learning rate in the table only.
+    """
     rows = []
-    for name in paper_presets():
-        preset = load_preset(name)
+    for published in table3():
+        preset = load_preset(published.name)
         training = MetaTrainSettings.model_validate(preset['meta_train'])
         evaluation = EvaluateSettings.model_validate(preset['evaluate'])
         meta = training.meta
         rows.append(
             {
-                'preset': name,
+                'preset': published.name,
                 'actor loss': evaluation.actor_loss or 'bc',
                 'inner lr': f'{meta.inner_lr:g}',
-                'meta lr': f'{meta.meta_lr:g}',
+                'meta lr': f'{published.meta_lr:g}',
                 'inner steps': meta.inner_steps,
                 'ttt lr': f'{evaluation.ttt.lr:g}',
                 'checkpoint': int(evaluation.checkpoints[-1].name),

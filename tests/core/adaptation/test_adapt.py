@@ -1,6 +1,7 @@
 """Test-time training for one query: from a base agent to an expert, or a reason why not."""
 
 from collections import defaultdict
+import copy
 
 from metagcttt_core import (
     adapt,
@@ -286,42 +287,91 @@ def test_cancelled_within_one_step(dataset):
     assert_bit_equal(agent, weights)
 
 
-def test_pretrained_optimizer_state_is_used(dataset):
-    agent = tiny_agent()
-    state = {
+def with_optimizer_state(agent):
+    """The agent with an Adam state of 1000 steps whose moments differ from weight to weight."""
+    rng = np.random.default_rng(7)
+    agent.optimizer_state = {
         number: {
             'step': torch.tensor(1000.0),
-            'exp_avg': torch.full_like(weight, 0.5),
-            'exp_avg_sq': torch.full_like(weight, 0.25),
+            'exp_avg': torch.from_numpy(rng.normal(0, 0.5, weight.shape).astype(np.float32)),
+            'exp_avg_sq': torch.from_numpy(rng.uniform(0.1, 1, weight.shape).astype(np.float32)),
         }
         for number, weight in enumerate(agent.trained_parameters())
     }
-    config = quick(steps=1, lr=1e-3, optimizer_state='pretrained')
-    arguments = (agent, dataset, support_of([13]), GOAL)
-    result = adapt(*arguments, config, optimizer_state=state)
-    fresh = adapt(*arguments, quick(steps=1, lr=1e-3), optimizer_state=state)
-    batch = {
-        'observations': torch.from_numpy(dataset.observations[[13]]),
-        'actions': torch.from_numpy(dataset.actions[[13]]),
-        'actor_goals': torch.from_numpy(GOAL[None].astype(np.float32)),
-    }
-    gradients = torch.autograd.grad(agent.losses(batch)[0], list(agent.parameters()))
-    for before, gradient, after, restarted in zip(
-        agent.parameters(),
+    return agent
+
+
+@EVERY_AGENT
+@pytest.mark.parametrize('actor_only', [False, True])
+def test_pretrained_state_continues_adam_of_pretraining(name, actor_only, dataset):
+    """Adam's step 1001 in numpy, in double precision, from the moments of step 1000."""
+    agent = with_optimizer_state(tiny_agent(name))
+    given = copy.deepcopy(agent.optimizer_state)
+    weights = weights_of(agent)
+    batches, losses = [], type(agent).losses
+
+    def spy(agent, batch, *, actor_only=False):
+        batches.append(batch)
+        return losses(agent, batch, actor_only=actor_only)
+
+    config = quick(steps=1, lr=1e-3, optimizer_state='pretrained', actor_only=actor_only)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(agent), 'losses', spy)
+        result = adapt(agent, dataset, support_of([13]), GOAL, config)
+    trained = list(agent.trained_parameters(actor_only=actor_only))
+    (batch,) = batches
+    gradients = torch.autograd.grad(agent.losses(batch, actor_only=actor_only)[0], trained)
+    numbers = [number for number, p in enumerate(agent.trained_parameters()) if is_in(p, trained)]
+    assert len(numbers) == len(trained)
+    for number, before, gradient, after in zip(
+        numbers,
+        trained,
         gradients,
-        result.agent.parameters(),
-        fresh.agent.parameters(),
+        result.agent.trained_parameters(actor_only=actor_only),
         strict=True,
     ):
-        # Adam's step 1001 by hand.
-        first = (0.9 * 0.5 + 0.1 * gradient) / (1 - 0.9**1001)
-        second = (0.999 * 0.25 + 0.001 * gradient.square()) / (1 - 0.999**1001)
-        expected = before - 1e-3 * first / (second.sqrt() + 1e-8)
-        torch.testing.assert_close(after, expected, rtol=1e-5, atol=1e-6)
-        restart = before - 1e-3 * gradient / (gradient.abs() + 1e-8)
-        torch.testing.assert_close(restarted, restart, rtol=1e-4, atol=1e-6)
-    again = adapt(*arguments, config, optimizer_state=state)
+        g, theta = (tensor.detach().double().numpy() for tensor in (gradient, before))
+        m, v = (given[number][key].double().numpy() for key in ('exp_avg', 'exp_avg_sq'))
+        first = (0.9 * m + 0.1 * g) / (1 - 0.9**1001)
+        second = (0.999 * v + 0.001 * g**2) / (1 - 0.999**1001)
+        expected = theta - 1e-3 * first / (np.sqrt(second) + 1e-8)
+        np.testing.assert_allclose(after.detach().numpy(), expected, rtol=0, atol=1e-6)
+        assert np.abs(after.detach().numpy() - theta).max() > 1e-5
+    if actor_only:
+        for key, weight in result.agent.state_dict().items():
+            assert key.startswith('actor.') or torch.equal(weight, weights[key])
+    assert_bit_equal(agent, weights)
+    for number, moments in given.items():
+        for key, tensor in moments.items():
+            assert torch.equal(agent.optimizer_state[number][key], tensor)
+    again = adapt(agent, dataset, support_of([13]), GOAL, config)
     assert_bit_equal(again.agent, weights_of(result.agent))
+
+
+def is_in(parameter, parameters):
+    return any(parameter is other for other in parameters)
+
+
+def test_fresh_state_is_the_default_and_forgets_the_agent_s(dataset):
+    plain, carrying = tiny_agent(), with_optimizer_state(tiny_agent())
+    arguments = (dataset, support_of(range(11)), GOAL, quick())
+    assert_bit_equal(adapt(carrying, *arguments).agent, weights_of(adapt(plain, *arguments).agent))
+
+
+def test_optimizer_state_travels_with_copies_and_experts(dataset):
+    agent = with_optimizer_state(tiny_agent())
+    config = quick(optimizer_state='pretrained')
+    expert = adapt(agent, dataset, support_of(range(11)), GOAL, config).agent
+    for copied in (agent.clone(), agent.to('cpu'), expert):
+        assert copied.optimizer_state is agent.optimizer_state
+
+
+def test_optimizer_state_that_does_not_fit_is_refused(dataset):
+    agent = with_optimizer_state(tiny_agent())
+    agent.origin = 'out/run/checkpoint'
+    del agent.optimizer_state[2]
+    with pytest.raises(ValueError, match=r'out/run/checkpoint: optimiser state of parameter 2'):
+        adapt(agent, dataset, support_of([0]), GOAL, quick(optimizer_state='pretrained'))
 
 
 def test_memory_mapped_dataset_gives_the_same_expert(dataset, tmp_path):
@@ -356,7 +406,7 @@ def test_support_of_a_real_query_makes_an_expert(dataset):
         ({}, np.zeros(3), {}, r'goal must have shape \(2,\), got \(3,\)'),
         ({}, np.zeros((1, 2)), {}, r'goal must have shape \(2,\), got \(1, 2\)'),
         ({}, np.array([0, np.inf]), {}, 'goal holds a non-finite value'),
-        ({}, GOAL, {'optimizer_state': 'pretrained'}, 'needs the optimiser state of pre-training'),
+        ({}, GOAL, {'optimizer_state': 'pretrained'}, 'the agent: has no optimiser state'),
     ],
 )
 def test_what_does_not_fit_together_is_refused(agent_settings, goal, ttt, message, dataset):

@@ -29,6 +29,10 @@ def test_defaults_are_those_of_the_paper():
         ({'fix_actor_goal': 1.1}, 'fix_actor_goal\n.*less than or equal to 1'),
         ({'ratio': -0.1}, 'ratio\n.*greater than or equal to 0'),
         ({'horizon': 0}, 'horizon\n.*greater than or equal to 1'),
+        (
+            {'optimizer': 'sgd', 'optimizer_state': 'pretrained'},
+            'optimizer_state=pretrained is the state of Adam.*optimizer is sgd',
+        ),
         ({'step': 3}, "no setting 'step'; did you mean 'steps'"),
     ],
 )

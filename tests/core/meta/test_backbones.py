@@ -22,7 +22,6 @@ def quick(**settings) -> MetaConfig:
             'outer_steps': 1,
             'inner_steps': 4,
             'inner_lr': 0.02,
-            'meta_lr': 0.05,
             'batch_size': 16,
             'filter': FilterConfig(epsilon=4.0, top_percent=100),
             **settings,

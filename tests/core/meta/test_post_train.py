@@ -12,7 +12,11 @@ from metagcttt_core.adaptation.batches import QueryBatches
 from metagcttt_core.agents import AGENTS
 from metagcttt_core.meta import tasks
 from metagcttt_core.meta.tasks import TaskSampler
-from metagcttt_core.meta.updates import META_UPDATES
+from metagcttt_core.meta.updates import GRADIENT_UPDATES, META_UPDATES
+from metagcttt_core.training.checkpoint import load_training_state
+from metagcttt_core.training.config import PretrainConfig
+from metagcttt_core.training.optimizers import pretrained_state
+from metagcttt_core.training.pretrain import pretrain
 from metagcttt_core.training.run import TrainingInterrupted, TrainingRun
 import numpy as np
 import pytest
@@ -37,7 +41,6 @@ def quick(**settings) -> MetaConfig:
             'outer_steps': 4,
             'inner_steps': 3,
             'inner_lr': 0.05,
-            'meta_lr': 0.02,
             'batch_size': 8,
             'filter': WIDE,
             **settings,
@@ -85,7 +88,7 @@ def test_one_outer_step_by_hand(algorithm, early_stopping, batch, one_place):
         outer_steps=1,
         inner_steps=6,
         inner_lr=0.4,
-        meta_lr=0.1,
+        meta_lr={'continual': None, 'reptile': 0.1, 'fomaml': 0.01}[algorithm],
         meta_batch_size=batch,
         early_stopping=early_stopping,
     )
@@ -114,7 +117,7 @@ def test_one_outer_step_by_hand(algorithm, early_stopping, batch, one_place):
         expected = {
             'continual': expert,
             'reptile': theta + 0.1 * (expert - theta),
-            'fomaml': theta - 0.1 * gradient / (gradient.abs() + 1e-8),
+            'fomaml': theta - 0.01 * gradient / (gradient.abs() + 1e-8),
         }[algorithm]
         torch.testing.assert_close(own, expected, rtol=1e-4, atol=1e-5)
 
@@ -144,6 +147,25 @@ def test_given_agent_is_left_alone_and_runs_repeat(algorithm, name):
     assert_changed(first, weights)
     assert_bit_equal(post_train(agent, dataset, config, seed=1), weights_of(first))
     assert_changed(post_train(agent, dataset, config, seed=2), weights_of(first))
+
+
+@EVERY_ALGORITHM
+@EVERY_AGENT
+def test_optimizer_state_of_pretraining_is_kept(algorithm, name, tmp_path):
+    """The outer Adam, where there is one, is another optimiser and has a state of its own."""
+    agent, dataset = tiny_agent(name), random_dataset([15, 15])
+    agent = pretrain(agent, dataset, PretrainConfig(steps=3, batch_size=8))
+    state = {n: moments['exp_avg'].clone() for n, moments in pretrained_state(agent).items()}
+    post_train(agent, dataset, quick(algorithm=algorithm), run=run_in(tmp_path))
+    loaded = pretrained_state(load_checkpoint(tmp_path))
+    assert loaded.keys() == state.keys()
+    for number, moment in state.items():
+        assert float(loaded[number]['step']) == 3
+        assert torch.equal(loaded[number]['exp_avg'], moment)
+    outer = load_training_state(tmp_path).optimizer
+    assert {float(moments['step']) for moments in outer.values()} == (
+        {4.0} if algorithm in GRADIENT_UPDATES else set()
+    )
 
 
 @EVERY_ALGORITHM

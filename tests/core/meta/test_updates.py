@@ -18,7 +18,7 @@ import pytest
 from tests.core.builders import assert_bit_equal, tiny_agent, weights_of
 import torch
 
-CONFIG = MetaConfig(meta_lr=0.25)
+CONFIG = MetaConfig(algorithm='reptile', meta_lr=0.25)
 
 
 def constant(value: float, name: str = 'gcbc'):
@@ -70,7 +70,7 @@ def test_reptile_with_beta_one_is_continual():
     experts = [expert_of(tiny_agent(seed=seed)) for seed in (1, 2, 3)]
     bases = [tiny_agent(), tiny_agent()]
     continual(bases[0], experts, CONFIG)
-    reptile(bases[1], experts, MetaConfig(meta_lr=1.0))
+    reptile(bases[1], experts, MetaConfig(algorithm='reptile', meta_lr=1.0))
     for name, weight in bases[0].state_dict().items():
         torch.testing.assert_close(bases[1].state_dict()[name], weight)
 

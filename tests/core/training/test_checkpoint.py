@@ -10,6 +10,7 @@ from metagcttt_core import CheckpointError, files, load_checkpoint, save_checkpo
 from metagcttt_core.agents import AGENTS
 from metagcttt_core.training import checkpoint
 from metagcttt_core.training.checkpoint import has_checkpoint, load_training_state, TrainingState
+from metagcttt_core.training.optimizers import pretrained_state
 import pytest
 import safetensors.torch
 from tests.core.builders import assert_bit_equal, tiny_agent, weights_of
@@ -124,6 +125,58 @@ def test_training_state_comes_back(tmp_path):
         for key, tensor in state.optimizer[number].items():
             assert torch.equal(loaded.optimizer[number][key], tensor)
             assert loaded.optimizer[number][key].dtype == tensor.dtype
+
+
+def adam_state(agent, value: float) -> dict[int, dict[str, torch.Tensor]]:
+    return {
+        number: {
+            'step': torch.tensor(value),
+            'exp_avg': torch.full_like(weight, value),
+            'exp_avg_sq': torch.full_like(weight, value + 1),
+        }
+        for number, weight in enumerate(agent.trained_parameters())
+    }
+
+
+def assert_same_state(state, expected):
+    assert state.keys() == expected.keys()
+    for number, moments in expected.items():
+        assert state[number].keys() == moments.keys()
+        assert all(torch.equal(state[number][name], moments[name]) for name in moments)
+
+
+@EVERY_AGENT
+@pytest.mark.parametrize('stage', [None, 'pretrain', 'post_train'])
+def test_optimizer_state_of_pretraining_comes_back_with_the_agent(name, stage, tmp_path):
+    """Also beside the state of the outer Adam, by which a post-training run is resumed."""
+    agent = tiny_agent(name)
+    agent.optimizer_state = adam_state(agent, 5.0)
+    outer = agent.optimizer_state if stage == 'pretrain' else adam_state(agent, 2.0)
+    training = stage and TrainingState(stage, 7, {}, outer)
+    save_checkpoint(agent, tmp_path, training)
+    loaded = load_checkpoint(tmp_path)
+    assert_same_state(loaded.optimizer_state, agent.optimizer_state)
+    assert_bit_equal(loaded, weights_of(agent))
+    if stage:
+        assert_same_state(load_training_state(tmp_path).optimizer, outer)
+    (weights,) = tmp_path.glob('*.safetensors')
+    groups = {name.split('.')[0] for name in safetensors.torch.load(weights.read_bytes())}
+    expected = {None: {'pretraining'}, 'pretrain': {'optimizer'}}
+    assert groups == {'agent'} | expected.get(stage, {'pretraining', 'optimizer'})
+
+
+def test_policy_without_optimizer_state_has_none(tmp_path):
+    saved_agent(tmp_path)
+    loaded = load_checkpoint(tmp_path)
+    assert loaded.optimizer_state is None
+    with pytest.raises(ValueError, match=rf'{tmp_path}: has no optimiser state of pre-training;'):
+        pretrained_state(loaded)
+
+
+def test_state_of_the_outer_adam_is_not_that_of_pretraining(tmp_path):
+    agent = tiny_agent()
+    save_checkpoint(agent, tmp_path, TrainingState('post_train', 3, {}, adam_state(agent, 2.0)))
+    assert load_checkpoint(tmp_path).optimizer_state is None
 
 
 def test_checkpoint_without_a_training_state_cannot_be_resumed(tmp_path):
@@ -305,6 +358,14 @@ def test_non_finite_agent_is_not_saved_over_a_good_checkpoint(tmp_path):
     with pytest.raises(CheckpointError, match=r'not saved, weight actor\.mean\.bias holds'):
         save_checkpoint(bad, tmp_path)
     assert_bit_equal(load_checkpoint(tmp_path), weights_of(good))
+
+
+def test_non_finite_optimizer_state_is_not_saved(tmp_path):
+    agent = tiny_agent()
+    agent.optimizer_state = adam_state(agent, float('nan'))
+    with pytest.raises(CheckpointError, match=r'not saved, pretraining\.0\.step holds'):
+        save_checkpoint(agent, tmp_path)
+    assert not has_checkpoint(tmp_path)
 
 
 class Crash(BaseException):

@@ -1,8 +1,9 @@
 """Pre-training: learns, repeats, and resumes bit-identically from every step."""
 
-from metagcttt_core import CheckpointError, load_checkpoint, TrajectoryDataset
+from metagcttt_core import CheckpointError, load_checkpoint, save_checkpoint, TrajectoryDataset
 from metagcttt_core.agents import AGENTS
 from metagcttt_core.data import GoalRelabeller
+from metagcttt_core.training.optimizers import pretrained_state
 from metagcttt_core.training.pretrain import pretrain, PretrainConfig
 from metagcttt_core.training.run import TrainingInterrupted, TrainingRun
 import numpy as np
@@ -16,6 +17,7 @@ from tests.core.builders import (
     tiny_agent,
     weights_of,
 )
+import torch
 
 EVERY_AGENT = pytest.mark.parametrize('name', sorted(AGENTS))
 CONFIG = PretrainConfig(steps=5, lr=0.01, batch_size=8)
@@ -42,6 +44,27 @@ def test_pretraining_leaves_the_given_agent_and_repeats(name):
     assert_changed(first, weights)
     assert_bit_equal(pretrain(agent, dataset, CONFIG, seed=1), weights_of(first))
     assert_changed(pretrain(agent, dataset, CONFIG, seed=2), weights_of(first))
+
+
+@EVERY_AGENT
+def test_agent_comes_with_the_state_of_its_optimizer(name, tmp_path):
+    """Also from checkpoints, of the run and of the steps on its way."""
+    agent, dataset = tiny_agent(name), random_dataset()
+    run = run_in(tmp_path / 'run')
+
+    def keep(step, losses, agent):
+        save_checkpoint(agent, tmp_path / f'{step}')
+
+    trained = pretrain(agent, dataset, CONFIG, run=run, on_step=keep)
+    assert agent.optimizer_state is None
+    state = pretrained_state(trained)
+    assert {float(moments['step']) for moments in state.values()} == {5.0}
+    assert len(state) == len(list(trained.trained_parameters()))
+    for folder, step in (('run', 5), ('5', 5), ('2', 2)):
+        loaded = pretrained_state(load_checkpoint(tmp_path / folder))
+        assert {float(moments['step']) for moments in loaded.values()} == {step}
+        same = [torch.equal(loaded[n]['exp_avg'], state[n]['exp_avg']) for n in state]
+        assert all(same) if step == 5 else not any(same)
 
 
 def test_every_step_is_reported_with_its_losses():

@@ -245,7 +245,7 @@ def critic_rig(graph: Graph, dataset_file: Path, tmp_path: Path):
 def test_policy_with_a_critic_adapts_anew_as_the_offline_adaptation_does(critic_rig) -> None:
     rig = critic_rig()
     rig.goal()
-    deployed = rig.session._deployment
+    deployed = rig.session.deployment
     for step, xy in enumerate([(0.0, 0.0), (0.5, 0.0), (1.0, 0.0)]):
         rig.state(xy, step)
         action = rig.action_for(step)
@@ -264,7 +264,7 @@ def test_policy_with_a_critic_adapts_anew_as_the_offline_adaptation_does(critic_
 def test_critic_is_evaluated_towards_the_goal_before_the_next_adaptation(critic_rig) -> None:
     rig = critic_rig()
     evaluated: list[int] = []
-    value_cache = rig.session._deployment.trajectory_filter._value_cache
+    value_cache = rig.session.deployment.trajectory_filter._value_cache
     evaluate = value_cache._evaluate
 
     def counted(value_fn, goal, known, rows) -> None:
@@ -275,7 +275,7 @@ def test_critic_is_evaluated_towards_the_goal_before_the_next_adaptation(critic_
     rig.goal()
     rig.state()
     rig.action_for(0)
-    num_rows = rig.session._deployment.dataset.num_rows
+    num_rows = rig.session.deployment.dataset.num_rows
     rig.graph.wait(lambda: sum(evaluated) == num_rows, 'V of every row')
     rig.graph.wait(lambda: not rig.session._adapter.num_pending, 'the end of the evaluation')
     rig.state(step=2)
@@ -290,7 +290,7 @@ def test_critic_is_evaluated_ahead_only_for_goals_that_are_adapted_to_again(
 ) -> None:
     rig = critic_rig(horizon=horizon)
     ahead: list[list[float]] = []
-    found = rig.session._deployment.trajectory_filter
+    found = rig.session.deployment.trajectory_filter
     monkeypatch.setattr(found, 'prefetch_values', lambda _, goal, __: ahead.append(list(goal)))
     rig.goal()
     rig.state()

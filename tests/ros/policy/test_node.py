@@ -162,6 +162,10 @@ def missing_checkpoint(tmp_path: Path, dataset: Path) -> dict:
     return {'checkpoint': str(tmp_path / 'nowhere')}
 
 
+def checkpoint_without_optimizer_state(tmp_path: Path, dataset: Path) -> dict:
+    return {'optimizer_state': 'pretrained'}
+
+
 def broken_dataset(tmp_path: Path, dataset: Path) -> dict:
     path = tmp_path / 'broken.npz'
     path.write_bytes(dataset.read_bytes()[:1000])
@@ -171,6 +175,7 @@ def broken_dataset(tmp_path: Path, dataset: Path) -> dict:
 @pytest.mark.parametrize(
     ('make_wrong', 'message'),
     [
+        (checkpoint_without_optimizer_state, 'has no optimiser state of pre-training; '),
         (missing_checkpoint, 'nowhere: no checkpoint there'),
         (broken_dataset, 'broken.npz'),
         (
@@ -250,4 +255,4 @@ def test_dataset_is_untouched_by_the_policy(make_rig, dataset_file: Path) -> Non
     rig.goal()
     rig.report()
     stored = TrajectoryDataset.load(dataset_file).observations
-    np.testing.assert_array_equal(rig.session._deployment.dataset.observations, stored)
+    np.testing.assert_array_equal(rig.session.deployment.dataset.observations, stored)

@@ -46,7 +46,6 @@ class MetaBenchmark(Benchmark):
         outer_steps=4,
         inner_steps=50,
         inner_lr=1e-4,
-        meta_lr=0.1,
         batch_size=256,
         filter=FilterConfig(variant='gcttt'),
     )

@@ -36,12 +36,18 @@ class Row(NamedTuple):
 
 def paper_presets() -> dict[str, dict[str, Any]]:
     """Fresh settings of each row of Table 3, nested by tool, by name of the preset."""
+    mazes = _read()['mazes']
+    return {row.name: _preset(row, **mazes[row.maze]) for row in table3()}
+
+
+def table3() -> list[Row]:
+    """The rows of Table 3."""
+    return [Row(*entries) for entries in _read()['rows']]
+
+
+def _read() -> dict[str, Any]:
     text = (files('metagcttt_tools.common') / 'paper.yaml').read_text(encoding='utf-8')
-    values = yaml.safe_load(text)
-    return {
-        row.name: _preset(row, **values['mazes'][row.maze])
-        for row in (Row(*entries) for entries in values['rows'])
-    }
+    return yaml.safe_load(text)
 
 
 def _preset(row: Row, environment: str, alpha: float, discount: float) -> dict[str, Any]:
@@ -56,16 +62,17 @@ def _preset(row: Row, environment: str, alpha: float, discount: float) -> dict[s
         'hidden': [512, 512, 512],
         'training': {'steps': 400_000, 'batch_size': _BATCH, 'lr': 3e-4},
     }
-    meta = {
+    meta: dict[str, Any] = {
         'algorithm': row.algorithm,
         'outer_steps': _OUTER_STEPS,
         'inner_steps': row.inner_steps,
         'inner_lr': row.inner_lr,
-        'meta_lr': row.meta_lr,
         'batch_size': _BATCH,
         'meta_batch_size': 1,
         'early_stopping': row.early_stopping,
     }
+    if row.algorithm != 'continual':  # which has one in the table, and no use for it
+        meta['meta_lr'] = row.meta_lr
     ttt: dict[str, Any] = {'lr': row.ttt_lr, 'batch_size': _BATCH}
     actor_loss = {}
     if row.data == 'stitch':

@@ -130,6 +130,14 @@ POLICY_NODE = (
     ),
     Parameter('actor_only', False, 'adapt the actor and not the critic', changes='now'),
     Parameter(
+        'optimizer_state',
+        'fresh',
+        'Adam moments and step count to begin an adaptation with; pretrained: those kept in the '
+        'checkpoint',
+        choices=('fresh', 'pretrained'),
+        changes='now',
+    ),
+    Parameter(
         'horizon',
         0,
         'control steps after which to adapt again from the base weights; 0: never',

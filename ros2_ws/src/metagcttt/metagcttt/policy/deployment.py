@@ -16,6 +16,7 @@ from metagcttt_core import (
 from metagcttt_core.adaptation import AdaptationCancelled, OnStep
 from metagcttt_core.config.assets import checkpoint_path, dataset_path
 from metagcttt_core.retrieval.value_cache import ValueFunction
+from metagcttt_core.training.optimizers import pretrained_state
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,6 +34,15 @@ class Deployment:
     def dataset(self) -> TrajectoryDataset:
         """The dataset behind the filter."""
         return self.trajectory_filter.dataset
+
+    def check_optimizer_state(self, choice: str) -> None:
+        """Refuse to begin adaptations with a state that the checkpoint does not have.
+
+        Raises:
+            ValueError: Names the checkpoint and what to do.
+        """
+        if choice == 'pretrained':
+            pretrained_state(self.agent)
 
 
 @dataclass(frozen=True)

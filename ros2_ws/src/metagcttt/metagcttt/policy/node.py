@@ -4,6 +4,7 @@ import secrets
 from typing import Any
 
 from metagcttt_core import FilterConfig
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool
@@ -33,6 +34,7 @@ class PolicyNode(LifecycleNode):
         self._settings = ParameterSet(
             self, POLICY_NODE, is_configured=lambda: self._session is not None
         )
+        self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._on_parameters_set)
         self.create_service(SetBool, 'enable', self._on_enable)
         self._failure = ''  # of the latest configuration
@@ -61,6 +63,7 @@ class PolicyNode(LifecycleNode):
             deployment = load_deployment(
                 self._settings['checkpoint'], self._settings['dataset'], config
             )
+            deployment.check_optimizer_state(self._settings['optimizer_state'])
             warm_up(deployment)
         except (OSError, ValueError) as error:
             # rclpy would swallow it silently.
@@ -119,6 +122,15 @@ class PolicyNode(LifecycleNode):
             return self._session.examine()
         level = Level.ERROR if self._failure else Level.OK
         return Health(level, self._failure or 'not configured')
+
+    def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        try:
+            for parameter in parameters:
+                if parameter.name == 'optimizer_state' and self._session is not None:
+                    self._session.deployment.check_optimizer_state(parameter.value)
+        except ValueError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
 
     def _on_parameters_set(self, parameters: list[Parameter]) -> None:
         if self._session is not None and any(p.name == 'rate_hz' for p in parameters):

@@ -31,6 +31,9 @@ class PolicySession:
     Acts on the goal in force with the base policy, then with the expert adapted to the goal.
     Adaptations run in a background thread; everything else, and every change of this object,
     happens in the thread that spins the node.
+
+    Attributes:
+        deployment: Policy and dataset.
     """
 
     def __init__(
@@ -53,7 +56,7 @@ class PolicySession:
         """
         self._node = node
         self._settings = settings
-        self._deployment = deployment
+        self.deployment = deployment
         self._instance = instance
         self._lockstep = settings['stepping'] == 'lockstep'
         self._acting = False
@@ -138,7 +141,7 @@ class PolicySession:
         if not self._lockstep:  # where an action names the state it answers
             out_of_order = self._order.refusal(message.episode_id, message.step)
         observation = to_array(message.observation)
-        fault = vector_fault('the state', observation, self._deployment.agent.obs_dim)
+        fault = vector_fault('the state', observation, self.deployment.agent.obs_dim)
         if out_of_order:
             self._monitor.faults.note('states_out_of_order', out_of_order, now_s)
         elif fault:
@@ -173,7 +176,7 @@ class PolicySession:
         self._goal_message = message
         self._adapter.cancel()
         self._pursuit = None
-        goal, agent = to_goal(message), self._deployment.agent
+        goal, agent = to_goal(message), self.deployment.agent
         fault = vector_fault('the goal', goal.observation, agent.obs_dim)
         if not message.active:
             self._node.get_logger().info(f'goal {goal.query_id} is over')
@@ -199,6 +202,7 @@ class PolicySession:
             early_stopping=self._settings['early_stopping'],
             test_fraction=self._settings['test_fraction'],
             actor_only=self._settings['actor_only'],
+            optimizer_state=self._settings['optimizer_state'],
             horizon=self._settings['horizon'] or None,
         )
 
@@ -251,7 +255,7 @@ class PolicySession:
         state = self._state
         if state is None:
             return
-        command = decide(state, pursuit, self._zero_reason(), self._deployment.agent.act_dim)
+        command = decide(state, pursuit, self._zero_reason(), self.deployment.agent.act_dim)
         if command.cause == 'unusable':
             self._monitor.faults.note('unusable_actions', command.reason, time.monotonic())
         if command.cause in ('unsafe', 'unusable'):
