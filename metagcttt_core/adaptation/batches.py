@@ -3,10 +3,14 @@
 from collections.abc import Iterator
 
 import numpy as np
+from torch.profiler import record_function
 
 from metagcttt_core.agents.agent import Agent, TensorBatch
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.data.relabel import GoalRelabeller
+
+BATCHES = 'batches'
+"""Name of the range that `torch.profiler` sees."""
 
 _GATHERED_STEPS = 64  # at once; bounds the memory of long inner loops
 
@@ -56,16 +60,18 @@ class QueryBatches:
         num_support = int(batch_size * self._ratio)
         for first in range(0, count, _GATHERED_STEPS):
             num_steps = min(_GATHERED_STEPS, count - first)
-            draws = [self._draw(batch_size, num_support, rng) for _ in range(num_steps)]
-            batches = self._gather(
-                {key: np.stack([draw[key] for draw in draws]) for key in draws[0]}
-            )
+            with record_function(BATCHES):
+                draws = [self._draw(batch_size, num_support, rng) for _ in range(num_steps)]
+                batches = self._gather(
+                    {key: np.stack([draw[key] for draw in draws]) for key in draws[0]}
+                )
             for step in range(num_steps):
                 yield {key: values[step] for key, values in batches.items()}
 
     def all(self, rng: np.random.Generator) -> TensorBatch:
         """Every support transition once."""
-        return self._gather(self._with_goals(self.rows, len(self.rows), rng))
+        with record_function(BATCHES):
+            return self._gather(self._with_goals(self.rows, len(self.rows), rng))
 
     def _draw(
         self, batch_size: int, num_support: int, rng: np.random.Generator

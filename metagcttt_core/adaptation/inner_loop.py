@@ -4,12 +4,16 @@ from collections.abc import Callable, Iterable, Sequence
 import math
 
 import torch
+from torch.profiler import record_function
 
 from metagcttt_core.adaptation.result import Adaptation, AdaptationCancelled, OnStep
 from metagcttt_core.agents.agent import Agent, OptimizerState, TensorBatch
 from metagcttt_core.training.config import OptimizerName
 from metagcttt_core.training.optimizers import make_optimizer
 from metagcttt_core.training.step import gradient_step
+
+INNER_STEP, TEST_LOSS = 'inner step', 'test loss'
+"""Names of the ranges that `torch.profiler` sees."""
 
 
 def run_inner_loop(
@@ -50,7 +54,8 @@ def run_inner_loop(
     for step, batch in enumerate(batches, start=1):
         if should_stop is not None and should_stop():
             raise AdaptationCancelled(f'cancelled before inner step {step}')
-        loss, parts = gradient_step(agent, stepper, parameters, batch, actor_only=actor_only)
+        with record_function(INNER_STEP):
+            loss, parts = gradient_step(agent, stepper, parameters, batch, actor_only=actor_only)
         train_losses.append(loss)
         if on_step is not None:
             on_step(step, {'total': loss, **parts})
@@ -90,7 +95,8 @@ class BestStep:
     @torch.no_grad()
     def test(self, step: int) -> None:
         """Take the test loss after `step` steps and keep the weights if they are the best."""
-        loss = self._agent.losses(self._batch, actor_only=self._actor_only)[0].item()
+        with record_function(TEST_LOSS):
+            loss = self._agent.losses(self._batch, actor_only=self._actor_only)[0].item()
         self.losses.append(loss)
         if math.isfinite(loss) and loss < self._smallest:
             self.step, self._smallest = step, loss

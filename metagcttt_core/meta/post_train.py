@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from torch.profiler import record_function
 
 from metagcttt_core.agents.agent import Agent
 from metagcttt_core.data.dataset import TrajectoryDataset
@@ -17,6 +18,9 @@ from metagcttt_core.meta.updates import GRADIENT_UPDATES, META_UPDATES
 from metagcttt_core.retrieval.trajectory_filter import TrajectoryFilter
 from metagcttt_core.training.optimizers import make_optimizer
 from metagcttt_core.training.run import TrainingRun
+
+TASKS, UPDATE = 'tasks', 'update'
+"""Names of the ranges that `torch.profiler` sees."""
 
 
 def post_train(
@@ -70,9 +74,11 @@ def post_train(
         # A generator for each task, whichever process draws it.
         rngs = [np.random.default_rng((seed, step, number)) for number in numbers]
         value_fn = base.value_fn
-        tasks = [sampler.sample(rng, value_fn) for rng in rngs]
+        with record_function(TASKS):
+            tasks = [sampler.sample(rng, value_fn) for rng in rngs]
         experts = adapt_to_tasks(base, dataset, tasks, config, rngs, inner_loops)
-        meta_update(base, experts, config, outer_optimizer)
+        with record_function(UPDATE):
+            meta_update(base, experts, config, outer_optimizer)
         reports = [
             TaskReport.of(
                 task,

@@ -6,6 +6,7 @@ from metagcttt_core import MetaConfig
 from metagcttt_core.config import assets_dir
 from metagcttt_tools.benchmarks.meta import MetaBenchmark
 import pytest
+from tests.tools.tables import squeezed
 import torch
 
 
@@ -40,6 +41,6 @@ def test_parts_add_up_and_every_way_is_measured(tmp_path, capsys):
         1e3 / results['outer_step']['outer steps per second']
     )
     assert {row['tasks'] for row in results['meta_batches']} == {2}
-    table = capsys.readouterr().out
+    table = squeezed(capsys.readouterr().out)
     assert '| inner steps |' in table
     assert 'outside forward, backward, optimiser' in table

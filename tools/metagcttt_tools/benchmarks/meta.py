@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-import cProfile
 from functools import partial
 from pathlib import Path
 import time
-from types import CodeType
 from typing import Any, TYPE_CHECKING
 
 from metagcttt_core import FilterConfig, MetaConfig, TrajectoryDataset, TrajectoryFilter
@@ -95,8 +93,8 @@ class MetaBenchmark(Benchmark):
             )
             ours += np.diff(ends).tolist()  # without the first, which builds the filter's index
             plain += [seconds(plain_step) for _ in ends]
-        profile = cProfile.Profile()
-        profile.runcall(post_train, agent, dataset, self.meta, self.seed)
+        index_s = seconds(partial(TrajectoryFilter, dataset, self.meta.filter))
+        parts = parts_of(partial(post_train, agent, dataset, self.meta, self.seed), index_s)
         step_s, plain_s = float(np.median(ours)), float(np.median(plain))
         outer = {
             'outer steps per second': 1 / step_s,
@@ -104,7 +102,7 @@ class MetaBenchmark(Benchmark):
             'plain PyTorch loop ms': 1e3 * plain_s,
             'outside forward, backward, optimiser': f'{1 - plain_s / step_s:.1%}',
         }
-        return outer, parts_of(profile, self.meta)
+        return outer, parts
 
     def _meta_batches(self, dataset: TrajectoryDataset) -> list[dict[str, Any]]:
         """Inner loops one by one and together, for networks of several sizes."""
@@ -192,36 +190,42 @@ def plain_outer_step(
     return outer_step
 
 
-def parts_of(profile: cProfile.Profile, config: MetaConfig) -> list[dict[str, Any]]:
-    """Milliseconds of each part of an outer step; parts are functions, with all they call."""
-    from metagcttt_core.adaptation.batches import QueryBatches
-    from metagcttt_core.adaptation.inner_loop import BestStep
-    from metagcttt_core.meta.tasks import TaskSampler
-    from metagcttt_core.meta.updates import META_UPDATES
-    from metagcttt_core.training.step import gradient_step
+def parts_of(post_train: Callable[..., Any], index_s: float) -> list[dict[str, Any]]:
+    """Milliseconds of each part of an outer step, as `torch.profiler` sees it.
 
-    functions: dict[str, tuple[Callable[..., Any], ...]] = {
-        'filter': (TrajectoryFilter.query,),
-        'task': (TaskSampler.sample,),
-        'batches': (QueryBatches.__init__, QueryBatches.all, QueryBatches.steps),
-        'inner steps': (gradient_step,),
-        'test losses': (BestStep.test,),
-        'update': (META_UPDATES[config.algorithm],),
-    }
-    spent: dict[CodeType | str, float] = {
-        entry.code: entry.totaltime for entry in profile.getstats()
-    }
+    Args:
+        post_train: Runs some outer steps; takes `on_step`.
+        index_s: Time it takes to build the filter's index, which belongs to no step.
+    """
+    from metagcttt_core.adaptation.batches import BATCHES
+    from metagcttt_core.adaptation.inner_loop import INNER_STEP, TEST_LOSS
+    from metagcttt_core.meta import OuterStep
+    from metagcttt_core.meta.post_train import TASKS, UPDATE
+    from torch.profiler import profile, ProfilerActivity
+
+    steps: list[OuterStep] = []
+    ends: list[float] = []
+
+    def on_step(step: OuterStep, _: Any) -> None:
+        steps.append(step)
+        ends.append(time.perf_counter())
+
+    with profile(activities=[ProfilerActivity.CPU]) as profiler:
+        began = time.perf_counter()
+        post_train(on_step=on_step)
+    ranges = {event.key: event.cpu_time_total / 1e3 for event in profiler.key_averages()}
+    filter_ms = sum(task.filter_ms for step in steps for task in step.tasks)
     parts = {
-        name: sum(spent.get(_code(each), 0.0) for each in part) for name, part in functions.items()
+        'filter': filter_ms,
+        'task': ranges[TASKS] - filter_ms,
+        'batches': ranges[BATCHES],
+        'inner steps': ranges[INNER_STEP],
+        'test losses': ranges.get(TEST_LOSS, 0.0),
+        'update': ranges[UPDATE],
     }
-    parts['task'] -= parts['filter']
-    total = max(spent.values()) - spent.get(_code(TrajectoryFilter.__init__), 0.0)
+    total = 1e3 * (ends[-1] - began - index_s)
     parts['rest'] = total - sum(parts.values())
     return [
-        {'part': name, 'ms': 1e3 * part / config.outer_steps, 'share': f'{part / total:.1%}'}
+        {'part': name, 'ms': part / len(steps), 'share': f'{part / total:.1%}'}
         for name, part in parts.items()
     ]
-
-
-def _code(function: Any) -> CodeType:
-    return getattr(function, '__wrapped__', function).__code__
