@@ -56,3 +56,11 @@ def test_order_of_the_reasons() -> None:
         'no state for 12.0 s',
         'the state has 0 values, 2 are needed',
     ]
+
+
+def test_robot_rests_from_a_state_out_of_order_to_the_next_in_order() -> None:
+    safety = Safety(enabled=True)
+    safety.saw_state(1.0, 1.0, 'state 0 of episode 1 came after state 5 of episode 1')
+    assert reason(safety, 1.0, 1.0).startswith('state 0 of episode 1 came after')
+    safety.saw_state(1.1, 1.1)
+    assert reason(safety, 1.1, 1.1) == ''

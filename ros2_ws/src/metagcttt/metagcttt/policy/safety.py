@@ -18,17 +18,20 @@ class Safety:
         self.enabled = enabled
         self.rivals = Senders()
         self.expired_goal = ''
+        self._out_of_order = ''
         self._state_s = self._state_clock_s = float('inf')
         self._lease_s = self._lease_end_s = float('inf')
 
-    def saw_state(self, now_s: float, clock_s: float) -> None:
+    def saw_state(self, now_s: float, clock_s: float, out_of_order: str = '') -> None:
         """Record the arrival of a state.
 
         Args:
             now_s: The time now, seconds of a monotonic clock.
             clock_s: The same by the node's clock, which may be simulated and paused.
+            out_of_order: Why the state is not used; the robot rests until one in order comes.
         """
         self._state_s, self._state_clock_s = now_s, clock_s
+        self._out_of_order = out_of_order
 
     def saw_goal(self, now_s: float, lease_s: float) -> None:
         """Record a goal or its repetition; it expires `lease_s` later, never with 0."""
@@ -65,4 +68,6 @@ class Safety:
             return self.expired_goal
         if age_s > timeout_s:
             return f'no state for {age_s:.1f} s'
+        if self._out_of_order:
+            return self._out_of_order
         return state.fault if state is not None else ''

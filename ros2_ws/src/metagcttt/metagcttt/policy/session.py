@@ -1,6 +1,5 @@
 """A configured policy: receives states and goals, adapts and acts."""
 
-from dataclasses import replace
 import time
 
 from metagcttt_core import Adaptation, TTTConfig
@@ -146,10 +145,8 @@ class PolicySession:
             self._monitor.faults.note('states_out_of_order', out_of_order, now_s)
         elif fault:
             self._monitor.faults.note('malformed_states', fault, now_s)
-        if out_of_order and self._state is not None:
-            # The simulator takes actions for its current episode only.
-            self._state = replace(self._state, fault=out_of_order)
-        else:
+        # The simulator takes actions for its current episode only.
+        if not out_of_order or self._state is None:
             self._state = State(
                 episode_id=message.episode_id,
                 step=message.step,
@@ -157,7 +154,7 @@ class PolicySession:
                 ended=message.terminated or message.truncated,
                 fault=fault,
             )
-        self._safety.saw_state(now_s, self._clock_s())
+        self._safety.saw_state(now_s, self._clock_s(), out_of_order)
         self._received_ns = info['received_timestamp']
         self._answered = False
         pursuit = self._pursuit
