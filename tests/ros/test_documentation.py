@@ -1,15 +1,20 @@
 from collections import Counter
 from collections.abc import Iterable
+import os
 from pathlib import Path
 import re
+import shlex
+import signal
 import subprocess
 import sys
+import time
 
 from metagcttt.parameter_set import Parameter
 from metagcttt.parameters import TABLES
 import pytest
 
-README = Path(__file__).parents[2] / 'ros2_ws' / 'README.md'
+ROOT = Path(__file__).parents[2]
+README = ROOT / 'ros2_ws' / 'README.md'
 
 
 def parameter_table(table: Iterable[Parameter]) -> str:
@@ -42,3 +47,61 @@ def test_readme_counts_the_fault_tests() -> None:
     stated = re.findall(r'^\| `(tests/ros/[\w/]+faults\.py)` \| (\d+) \|', text, re.MULTILINE)
     assert {file: int(count) for file, count in stated} == found
     assert len(found) == len(files) == 3
+
+
+def commands_of_the_documents() -> list[str]:
+    """What the READMEs say to start with tools/ros2run, and the programs for its recordings."""
+    texts = [path.read_text(encoding='utf-8') for path in (README, ROOT / 'README.md')]
+    lines = {line for text in texts for line in text.splitlines()}
+    return sorted(line for line in lines if re.match(r'(tools/ros2run|metagcttt) ', line))
+
+
+@pytest.mark.slow
+def test_documented_nodes_record_what_documented_programs_read(
+    ros_domain: int, tmp_path: Path
+) -> None:
+    for name in ('tools', 'assets', 'ros2_ws', '.venv'):
+        (tmp_path / name).symlink_to(ROOT / name)
+    environment = {
+        **os.environ,
+        'METAGCTTT_OVERRIDES': 'quick',
+        'PATH': f'{ROOT / ".venv" / "bin"}:{os.environ["PATH"]}',
+    }
+    commands = commands_of_the_documents()
+    nodes = [command for command in commands if command.startswith('tools/ros2run')]
+    started = [
+        subprocess.Popen(shlex.split(node), cwd=tmp_path, env=environment, stderr=subprocess.PIPE)
+        for node in nodes
+    ]
+    try:
+        deadline = time.monotonic() + 60
+        while not (tmp_path / 'run.mcap').exists():  # it subscribes at once
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        drive = (
+            'import rclpy; from metagcttt.commander import RobotCommander\n'
+            'rclpy.init(); robot = RobotCommander(); robot.set_task(1, seed=0)\n'
+            'print(robot.reach((20.0, 20.0), max_steps=60).steps)'
+        )
+        driven = subprocess.run(
+            [sys.executable, '-c', drive], env=environment, capture_output=True, text=True
+        )
+        assert driven.stdout == '60\n', driven.stderr
+    finally:
+        for process in started:
+            process.send_signal(signal.SIGINT)
+        ends = [process.communicate(timeout=60)[1].decode() for process in started]
+    assert [process.returncode for process in started] == [0] * len(nodes), ends
+    assert {
+        'goal_node',
+        'policy_node',
+        'recorder_node',
+        'sim_bridge_node',
+        'visualization_node',
+    } <= {node.split()[2] for node in nodes}
+    for command in ('metagcttt import-recordings', 'metagcttt top-view'):
+        (line,) = [shown for shown in commands if shown.startswith(command)]
+        result = subprocess.run(
+            shlex.split(line), cwd=tmp_path, env=environment, capture_output=True, text=True
+        )
+        assert result.returncode == 0, result.stdout + result.stderr
