@@ -1,50 +1,25 @@
 """The registry of simulators, by name."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from difflib import get_close_matches
 
+from metagcttt_core.plugins import Registry
+
 from sim_bridge.maze_map import MazeMap
-from sim_bridge.mazes import ogbench, robotics
-from sim_bridge.simulator import MazeDescription, Simulator
+from sim_bridge.simulator import Family, MazeDescription, Simulator
 
-
-@dataclass(frozen=True)
-class Family:
-    """The simulators of one module.
-
-    Attributes:
-        names: Returns the names of its mazes.
-        canonical_name: Maps any accepted spelling to one of the names, others to None.
-        describe: Returns spec, plan and tasks of a named maze, without physics.
-        make: Builds the simulator of a named maze.
-    """
-
-    names: Callable[[], tuple[str, ...]]
-    canonical_name: Callable[[str], str | None]
-    describe: Callable[[str], MazeDescription]
-    make: Callable[[str], Simulator]
-
-
-FAMILIES: tuple[Family, ...] = (
-    Family(
-        ogbench.names,
-        ogbench.canonical_name,
-        ogbench.describe,
-        ogbench.OGBenchMaze,
-    ),
-    Family(
-        robotics.names,
-        robotics.canonical_name,
-        robotics.describe,
-        robotics.RoboticsMaze,
-    ),
+FAMILIES: Registry[Family] = Registry(
+    'metagcttt.simulators',
+    'family of simulators',
+    {
+        'ogbench': 'sim_bridge.mazes.ogbench:FAMILY',
+        'robotics': 'sim_bridge.mazes.robotics:FAMILY',
+    },
 )
 
 
 def environment_names() -> tuple[str, ...]:
     """Every name that `make_simulator` accepts."""
-    return tuple(name for family in FAMILIES for name in family.names())
+    return tuple(name for family in FAMILIES.values() for name in family.names())
 
 
 def make_simulator(name: str) -> Simulator:
@@ -80,7 +55,7 @@ def maze_map(name: str) -> MazeMap:
 
 
 def _find(name: str) -> tuple[Family, str]:
-    for family in FAMILIES:
+    for family in FAMILIES.values():
         canonical = family.canonical_name(name)
         if canonical is not None:
             return family, canonical

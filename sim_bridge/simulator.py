@@ -1,6 +1,7 @@
 """The simulator interface: every maze implements it."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -193,3 +194,20 @@ class Simulator(ABC):
     def __exit__(self, *_: object) -> None:
         """Close."""
         self.close()
+
+
+@dataclass(frozen=True)
+class Family:
+    """The simulators of one module.
+
+    Attributes:
+        names: Returns the names of its mazes.
+        canonical_name: Maps any accepted spelling to one of the names, others to None.
+        describe: Returns spec, plan and tasks of a named maze, without physics.
+        make: Builds the simulator of a named maze.
+    """
+
+    names: Callable[[], tuple[str, ...]]
+    canonical_name: Callable[[str], str | None]
+    describe: Callable[[str], MazeDescription]
+    make: Callable[[str], Simulator]

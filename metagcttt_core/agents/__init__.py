@@ -1,4 +1,4 @@
-"""Goal-conditioned agents; adding one is a module and a line in `AGENTS`."""
+"""Goal-conditioned agents; adding one is a module and a line in `registry.py`."""
 
 from typing import TYPE_CHECKING
 

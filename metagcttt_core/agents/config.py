@@ -1,13 +1,17 @@
 """Settings of the agents."""
 
-from typing import Literal
+from typing import Literal, TYPE_CHECKING
 
 from pydantic import Field, PositiveInt
 
+from metagcttt_core.agents.registry import AGENTS
 from metagcttt_core.config.settings import Settings
 from metagcttt_core.data.relabel import GoalConfig
 
-AgentName = Literal['gcbc', 'gciql']
+if TYPE_CHECKING:
+    AgentName = str
+else:
+    AgentName = AGENTS.names
 ActorLoss = Literal['ddpgbc', 'awr', 'bc']
 
 

@@ -1,15 +1,23 @@
 """The agents by name."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
-import torch
+from metagcttt_core.plugins import PluginError, Registry
 
-from metagcttt_core.agents.agent import Agent
-from metagcttt_core.agents.gcbc import GCBC
-from metagcttt_core.agents.gciql import GCIQL
+if TYPE_CHECKING:
+    from metagcttt_core.agents.agent import Agent
 
-AGENTS: dict[str, type[Agent]] = {agent.name: agent for agent in (GCBC, GCIQL)}
+AGENTS: Registry[type[Agent]] = Registry(
+    'metagcttt.agents',
+    'agent',
+    {
+        'gcbc': 'metagcttt_core.agents.gcbc:GCBC',
+        'gciql': 'metagcttt_core.agents.gciql:GCIQL',
+    },
+)
 
 
 def make_agent(
@@ -33,9 +41,12 @@ def make_agent(
 
     Raises:
         ValueError: For an unknown agent or setting, or a value out of range.
+        PluginError: If it is another package's and cannot be loaded, or has another name there.
     """
-    if name not in AGENTS:
-        raise ValueError(f'unknown agent {name!r}; known: {", ".join(AGENTS)}')
-    agent_type = AGENTS[name]
+    import torch
+
+    agent_type = AGENTS.find(name)
+    if agent_type.name != name:  # by which its checkpoints are loaded
+        raise PluginError(f'agent {name!r} must have that name, its own is {agent_type.name!r}')
     checked = agent_type.settings_type(hidden=tuple(hidden), **settings)
     return agent_type(obs_dim, act_dim, checked, torch.Generator().manual_seed(seed))

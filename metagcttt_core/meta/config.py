@@ -1,13 +1,18 @@
 """Settings of meta-post-training."""
 
-from typing import Literal, NamedTuple, Self
+import math
+from typing import NamedTuple, Self, TYPE_CHECKING
 
 from pydantic import Field, model_validator
 
 from metagcttt_core.adaptation.config import InnerLoopConfig
+from metagcttt_core.meta.registry import META_UPDATES
 from metagcttt_core.retrieval.config import FilterConfig
 
-Algorithm = Literal['continual', 'fomaml', 'reptile', 'maml']
+if TYPE_CHECKING:
+    Algorithm = str
+else:
+    Algorithm = META_UPDATES.names
 
 
 class _MetaLR(NamedTuple):
@@ -22,6 +27,7 @@ _META_LR = {
     'maml': _OUTER_ADAM,
     'reptile': _MetaLR('merging coefficient', 0.1, 1.0),  # the paper's most frequent one
 }
+_OF_ANOTHER_PACKAGE = _MetaLR('learning rate of the outer Adam', 3e-4, math.inf)
 
 
 class MetaConfig(InnerLoopConfig):
@@ -50,7 +56,7 @@ class MetaConfig(InnerLoopConfig):
                 'meta_lr has no effect on continual, which takes the mean of the adapted weights; '
                 f'leave it out, got {self.meta_lr:g}'
             )
-        what, _, largest = _META_LR[self.algorithm]
+        what, _, largest = _META_LR.get(self.algorithm, _OF_ANOTHER_PACKAGE)
         if self.meta_lr > largest:
             raise ValueError(
                 f'meta_lr is the {what} of {self.algorithm} and must be at most {largest:g}, '
@@ -63,4 +69,6 @@ class MetaConfig(InnerLoopConfig):
         """`meta_lr`, or the algorithm's default; 1 for CONTINUAL-TTT, which merges fully."""
         if self.algorithm == 'continual':
             return 1.0
-        return _META_LR[self.algorithm].default if self.meta_lr is None else self.meta_lr
+        if self.meta_lr is not None:
+            return self.meta_lr
+        return _META_LR.get(self.algorithm, _OF_ANOTHER_PACKAGE).default

@@ -12,9 +12,9 @@ from metagcttt_core.meta.config import MetaConfig
 from metagcttt_core.meta.experts import adapt_to_tasks, make_inner_loops
 from metagcttt_core.meta.health import check_finite
 from metagcttt_core.meta.parallel import first_process, own_tasks, reports_of_all
+from metagcttt_core.meta.registry import GRADIENT_UPDATES, META_UPDATES
 from metagcttt_core.meta.report import OuterStep, TaskReport
 from metagcttt_core.meta.tasks import TaskSampler
-from metagcttt_core.meta.updates import GRADIENT_UPDATES, META_UPDATES
 from metagcttt_core.retrieval.trajectory_filter import TrajectoryFilter
 from metagcttt_core.training.optimizers import make_optimizer
 from metagcttt_core.training.run import TrainingRun
@@ -64,7 +64,7 @@ def post_train(
     )
     meta_update = META_UPDATES[config.algorithm]
     outer_optimizer = None
-    if config.algorithm in GRADIENT_UPDATES:
+    if config.algorithm in GRADIENT_UPDATES or config.algorithm in META_UPDATES.plugins:
         parameters = base.trained_parameters(actor_only=config.actor_only)
         outer_optimizer = make_optimizer('adam', parameters, config.outer_lr)
     numbers = own_tasks(config.meta_batch_size)

@@ -2,7 +2,7 @@
 
 Each takes the base agent, changed in place, and one `Expert` per task of the meta-batch that this
 process adapted to; means are over the tasks of all processes. Adding one is a function and a line
-in `META_UPDATES`.
+in `registry.py`.
 """
 
 from collections.abc import Callable, Sequence
@@ -78,16 +78,6 @@ def maml(
         )
 
     _step_down_the_mean(gradient, base, experts, config, optimizer)
-
-
-META_UPDATES: dict[str, MetaUpdate] = {
-    'continual': continual,
-    'fomaml': fomaml,
-    'reptile': reptile,
-    'maml': maml,
-}
-GRADIENT_UPDATES = frozenset({'fomaml', 'maml'})
-"""Updates that step through the outer Adam, with learning rate beta."""
 
 
 def _step_down_the_mean(

@@ -1,12 +1,16 @@
 """Settings of the trajectory filter."""
 
-from typing import Literal, Self
+from typing import Self, TYPE_CHECKING
 
 from pydantic import Field, model_validator
 
 from metagcttt_core.config.settings import Settings
+from metagcttt_core.retrieval.registry import VARIANTS
 
-Variant = Literal['paper', 'gcttt', 'random', 'relevance_only', 'score_only']
+if TYPE_CHECKING:
+    Variant = str
+else:
+    Variant = VARIANTS.names
 
 
 class FilterConfig(Settings):

@@ -8,10 +8,11 @@ import numpy as np
 
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.retrieval.config import FilterConfig
+from metagcttt_core.retrieval.registry import VARIANTS
 from metagcttt_core.retrieval.spatial_index import SpatialIndex
 from metagcttt_core.retrieval.support import SupportSet
 from metagcttt_core.retrieval.value_cache import ValueCache, ValueFunction
-from metagcttt_core.retrieval.variants import Task, VARIANTS
+from metagcttt_core.retrieval.variants import Task
 
 __all__ = ['TrajectoryFilter', 'ValueFunction']
 

@@ -140,11 +140,6 @@ def score_only(task: Task, config: FilterConfig) -> Candidates:
     )
 
 
-VARIANTS: dict[str, Callable[[Task, FilterConfig], Candidates]] = {
-    rule.__name__: rule for rule in (paper, gcttt, random, relevance_only, score_only)
-}
-
-
 def smallest_per_episode(episodes: np.ndarray, rows: np.ndarray, values: np.ndarray) -> PerEpisode:
     """The row of the smallest value in each trajectory, the first on ties.
 

@@ -20,7 +20,7 @@ from sim_bridge.mazes.ogbench_layouts import (
     UNIT_M,
 )
 from sim_bridge.opengl import choose_opengl_library
-from sim_bridge.simulator import Array, MazeDescription, SimulatorSpec, Task
+from sim_bridge.simulator import Array, Family, MazeDescription, SimulatorSpec, Task
 
 _DATASET_NAME = re.compile(r'(?P<maze>\w+-\w+)-(navigate|stitch|explore)-v0')
 
@@ -191,6 +191,9 @@ class OGBenchMaze(GymMaze):
     def _is_near_teleport(self) -> bool:
         """True if the next step may end in a teleport, whose exit is random."""
         return any(math.dist(self.position, xy) <= _TELEPORT_REACH_M for xy in self._teleport_xys)
+
+
+FAMILY = Family(names, canonical_name, describe, OGBenchMaze)
 
 
 def standing_pose(

@@ -20,7 +20,7 @@ from sim_bridge.mazes.robotics_layouts import (
     task_cells,
 )
 from sim_bridge.opengl import choose_opengl_library
-from sim_bridge.simulator import Array, MazeDescription, SimulatorSpec, Task
+from sim_bridge.simulator import Array, Family, MazeDescription, SimulatorSpec, Task
 
 _PICTURE_PIXELS = 200
 _PICTURE_MARGIN = 1.1
@@ -172,6 +172,9 @@ class RoboticsMaze(GymMaze):
         check_seed(seed)
         self._rng = np.random.default_rng(seed)
         self._next_seed = seed
+
+
+FAMILY = Family(names, canonical_name, describe, RoboticsMaze)
 
 
 def _parts(name: str) -> tuple[str, str, str]:

@@ -27,7 +27,8 @@ PROJECT = tomllib.loads((Path(__file__).parents[2] / 'pyproject.toml').read_text
         (
             'ogbench',
             'download',
-            'this takes ogbench, which is not installed: pip install "metagcttt-core[mazes]"',
+            'this takes ogbench, which is not installed: pip install '
+            + ('"metagcttt-core[mazes]"' if sys.version_info < (3, 13) else '--no-deps ogbench'),
         ),
         ('rclpy', 'demo', 'this takes ROS 2 and the workspace (rclpy is missing): make setup'),
     ],

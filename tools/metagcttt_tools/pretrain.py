@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from functools import partial
+from contextlib import suppress
+from functools import cache, partial
 from pathlib import Path
-from typing import Annotated, Any, get_args, Self, TYPE_CHECKING
+from typing import Annotated, Any, Self, TYPE_CHECKING
 
 from metagcttt_core import DatasetError, TrajectoryDataset
-from metagcttt_core.agents import AgentName
+from metagcttt_core.agents import AgentName, AGENTS
 from metagcttt_core.agents.config import GCBCSettings, GCIQLSettings
+from metagcttt_core.plugins import PluginError
 from metagcttt_core.training.config import Precision, PretrainConfig
-from pydantic import Field, model_validator
+from pydantic import create_model, Field, model_validator
 import tyro
 
 from metagcttt_tools.common.cli import fail, parse
@@ -64,7 +66,7 @@ class PretrainSettings(RunSettings):
 
     def decisive(self) -> dict[str, Any]:
         """The settings that decide the result, without those of other agents."""
-        others = tuple(f'{name}.' for name in get_args(AgentName) if name != self.agent)
+        others = tuple(f'{name}.' for name in AGENTS if name != self.agent)
         return {n: v for n, v in super().decisive().items() if not n.startswith(others)}
 
     @property
@@ -74,14 +76,27 @@ class PretrainSettings(RunSettings):
 
     @model_validator(mode='after')
     def _units_in_one_place(self) -> Self:
+        if self.agent not in type(self).model_fields:
+            AGENTS.find(self.agent)  # says why it cannot be loaded
         if 'hidden' in getattr(self, self.agent).model_dump(exclude_defaults=True):
             raise ValueError(f'{self.agent}.hidden has no effect here; set hidden')
         return self
 
 
+@cache
+def settings_type() -> type[PretrainSettings]:
+    """The settings with those of agents from other packages, under the names of the agents."""
+    fields: dict[str, Any] = {}
+    for name in AGENTS.plugins:
+        with suppress(PluginError):  # raised by the settings where that agent is asked for
+            settings = AGENTS[name].settings_type
+            fields[name] = (Annotated[settings, tyro.conf.AvoidSubcommands], settings())
+    return create_model('PretrainSettings', __base__=PretrainSettings, **fields)
+
+
 def main(argv: list[str] | None = None) -> None:
     """Run the program."""
-    settings = parse(PretrainSettings, _DESCRIPTION, 'pretrain', argv)
+    settings = parse(settings_type(), _DESCRIPTION, 'pretrain', argv)
     from metagcttt_core import CheckpointError
 
     use_threads(settings.threads)

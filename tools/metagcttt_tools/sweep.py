@@ -27,7 +27,7 @@ from metagcttt_tools.common.session import (
 )
 from metagcttt_tools.evaluate import EvaluateSettings
 from metagcttt_tools.meta_train import MetaTrainSettings
-from metagcttt_tools.pretrain import PretrainSettings
+from metagcttt_tools.pretrain import PretrainSettings, settings_type
 
 _DESCRIPTION = """Run a study: pre-train a policy per seed, post-train each arm, evaluate all.
 
@@ -162,7 +162,7 @@ class Study:
     def _pretrain(self, seed: int) -> PretrainSettings:
         values = preset_values(self.settings.base, 'pretrain')
         folder = self.settings.out / f'base-{seed}'
-        return PretrainSettings.model_validate(
+        return settings_type().model_validate(
             values | {'seed': seed, 'out': folder, 'resume': True}
         )
 

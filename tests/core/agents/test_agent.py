@@ -210,7 +210,10 @@ def test_default_network_is_the_published_one():
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [
-        ({'name': 'gcbb'}, "unknown agent 'gcbb'; known: gcbc, gciql"),
+        (
+            {'name': 'gcbb'},
+            "unknown agent 'gcbb'; did you mean 'gcbc'\\? \\(known: gcbc, gciql\\)",
+        ),
         ({'obs_dim': 0}, 'obs_dim must be at least 1, got 0'),
         ({'act_dim': -1}, 'act_dim must be at least 1, got -1'),
         ({'hidden': ()}, 'hidden\n.*at least 1'),

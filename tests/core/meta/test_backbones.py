@@ -3,7 +3,7 @@
 from metagcttt_core import FilterConfig, MetaConfig, post_train
 from metagcttt_core.meta import experts
 from metagcttt_core.meta.experts import adapts_together
-from metagcttt_core.meta.updates import META_UPDATES
+from metagcttt_core.meta.registry import META_UPDATES
 import pytest
 from tests.core.builders import random_dataset, tiny_agent, weights_of
 import torch

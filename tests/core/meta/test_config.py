@@ -33,7 +33,7 @@ def test_outer_rate_is_by_default_that_of_the_algorithm(algorithm, given, rate):
 @pytest.mark.parametrize(
     ('settings', 'message'),
     [
-        ({'algorithm': 'mamml'}, "algorithm\n.*'continual', 'fomaml'"),
+        ({'algorithm': 'mamml'}, 'algorithm\n.*unknown meta-update.*known: continual, fomaml'),
         ({'outer_steps': 0}, 'outer_steps\n.*greater than or equal to 1'),
         ({'inner_steps': 0}, 'inner_steps\n.*greater than or equal to 1'),
         ({'inner_lr': -1e-3}, 'inner_lr\n.*greater than 0'),

@@ -5,7 +5,7 @@ import math
 from metagcttt_core import load_checkpoint, MetaConfig, post_train
 from metagcttt_core.meta import DivergedError, health, OuterStep, TaskReport
 from metagcttt_core.meta.health import check_finite, HealthWatch
-from metagcttt_core.meta.updates import META_UPDATES
+from metagcttt_core.meta.registry import META_UPDATES
 from metagcttt_core.training.run import TrainingRun
 import numpy as np
 import pytest

@@ -11,8 +11,8 @@ from metagcttt_core import (
 from metagcttt_core.adaptation.batches import QueryBatches
 from metagcttt_core.agents import AGENTS
 from metagcttt_core.meta import tasks
+from metagcttt_core.meta.registry import GRADIENT_UPDATES, META_UPDATES
 from metagcttt_core.meta.tasks import TaskSampler
-from metagcttt_core.meta.updates import GRADIENT_UPDATES, META_UPDATES
 from metagcttt_core.training.checkpoint import load_training_state
 from metagcttt_core.training.config import PretrainConfig
 from metagcttt_core.training.optimizers import pretrained_state

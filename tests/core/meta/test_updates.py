@@ -5,13 +5,8 @@ import copy
 from metagcttt_core import MetaConfig
 from metagcttt_core.adaptation.result import Adaptation
 from metagcttt_core.meta.experts import Expert
-from metagcttt_core.meta.updates import (
-    continual,
-    fomaml,
-    GRADIENT_UPDATES,
-    META_UPDATES,
-    reptile,
-)
+from metagcttt_core.meta.registry import GRADIENT_UPDATES, META_UPDATES
+from metagcttt_core.meta.updates import continual, fomaml, reptile
 from metagcttt_core.training.optimizers import make_optimizer
 import numpy as np
 import pytest

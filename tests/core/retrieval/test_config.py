@@ -16,7 +16,7 @@ def test_defaults_are_those_of_the_paper():
 @pytest.mark.parametrize(
     ('settings', 'message'),
     [
-        ({'variant': 'papr'}, "variant\n.*'paper', 'gcttt'"),
+        ({'variant': 'papr'}, "variant\n.*did you mean 'paper'.*relevance_only"),
         ({'epsilon': 0}, 'epsilon\n.*greater than 0'),
         ({'epsilon': float('inf')}, 'epsilon\n.*finite number'),
         ({'top_percent': 0}, 'top_percent\n.*greater than 0'),

@@ -10,7 +10,7 @@ import sys
 
 from metagcttt_core import load_checkpoint, make_agent, save_checkpoint
 from metagcttt_core.meta.diagnostics import Diagnostics
-from metagcttt_core.meta.updates import META_UPDATES
+from metagcttt_core.meta.registry import META_UPDATES
 from metagcttt_core.training.checkpoint import load_training_state
 from metagcttt_tools import meta_train
 from metagcttt_tools.common.run_log import read_metrics

@@ -1,0 +1,75 @@
+"""The example packages install and do what they show."""
+
+import json
+import os
+from pathlib import Path
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope='module')
+def guests(tmp_path_factory) -> Path:
+    """A folder with the example's package installed, built from a copy."""
+    folder = tmp_path_factory.mktemp('example')
+    shutil.copytree(ROOT / 'examples' / 'custom_agent', folder / 'source')
+    target = ['--target', str(folder / 'installed'), str(folder / 'source')]
+    options = ['-q', '--no-deps', '--no-build-isolation', '--no-index']
+    subprocess.run([sys.executable, '-m', 'pip', 'install', *options, *target], check=True)
+    return folder / 'installed'
+
+
+def metagcttt(arguments: list[str], folder: Path, guests: Path) -> subprocess.CompletedProcess:
+    path = os.pathsep.join(map(str, (guests, ROOT, ROOT / 'tools')))
+    return subprocess.run(
+        [sys.executable, '-m', 'metagcttt_tools', *arguments],
+        cwd=folder,
+        env={**os.environ, 'PYTHONPATH': path},
+        capture_output=True,
+        text=True,
+    )
+
+
+def test_agent_of_another_package_trains_with_its_settings_and_adapts(tmp_path, guests) -> None:
+    rng = np.random.default_rng(0)
+    np.savez(
+        tmp_path / 'mine.npz',
+        observations=rng.uniform(0, 8, (300, 2)).astype(np.float32),
+        actions=rng.uniform(-1, 1, (300, 2)).astype(np.float32),
+        terminals=np.arange(300) % 100 == 99,
+    )
+    data = ['--dataset', 'mine.npz']
+    flags = ['--agent', 'huber', '--huber.delta', '0.5', '--hidden', '8', '--training.steps', '2']
+    run = metagcttt(['pretrain', *data, *flags, '--out', 'base'], tmp_path, guests)
+    assert run.returncode == 0, run.stderr
+    index = json.loads((tmp_path / 'base' / 'checkpoint' / 'checkpoint.json').read_text())
+    assert index['agent'] == 'huber'
+    assert index['settings']['delta'] == 0.5
+    more = ['pretrain', '--out', 'base', '--resume', '--training.steps', '3']
+    run = metagcttt(more, tmp_path, guests)
+    assert run.returncode == 0, run.stderr
+    policy = ['--checkpoint', 'base/checkpoint', '--out', 'meta']
+    steps = ['--meta.outer-steps', '1', '--meta.inner-steps', '1']
+    run = metagcttt(['meta-train', *data, *policy, *steps], tmp_path, guests)
+    assert run.returncode == 0, run.stderr
+
+
+def test_help_offers_the_agent_and_its_settings(tmp_path, guests) -> None:
+    text = metagcttt(['pretrain', '--help'], tmp_path, guests).stdout
+    assert '--agent {gcbc,gciql,huber}' in text
+    assert '--huber.delta' in text
+
+
+def test_misspelt_agent_is_refused_with_the_known_ones(tmp_path, guests) -> None:
+    (tmp_path / 'mine.yaml').write_text('pretrain: {agent: hubert}')
+    run = metagcttt(['pretrain', '--preset', 'mine.yaml'], tmp_path, guests)
+    assert run.returncode == 2
+    assert "unknown agent 'hubert'; did you mean 'huber'?" in run.stderr
+    run = metagcttt(['pretrain', '--agent', 'hubert'], tmp_path, guests)
+    assert run.returncode == 2
+    assert 'huber' in run.stderr
