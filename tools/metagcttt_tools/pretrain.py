@@ -8,7 +8,7 @@ from typing import Annotated, Any, get_args, Self, TYPE_CHECKING
 
 from metagcttt_core import DatasetError, TrajectoryDataset
 from metagcttt_core.agents import AgentName
-from metagcttt_core.agents.config import GCBCSettings, GCIQLSettings
+from metagcttt_core.agents.config import GCBCOptions, GCIQLOptions
 from metagcttt_core.training.config import Precision, PretrainConfig
 from pydantic import Field, model_validator
 import tyro
@@ -42,8 +42,8 @@ class PretrainSettings(RunSettings):
     out: Path = Field(Path('out/pretrain'), description='folder of the run')
     agent: AgentName = Field('gcbc', description='kind of agent')
     hidden: tuple[int, ...] = Field((512, 512, 512), description='units of each hidden layer')
-    gcbc: Annotated[GCBCSettings, tyro.conf.AvoidSubcommands] = GCBCSettings()
-    gciql: Annotated[GCIQLSettings, tyro.conf.AvoidSubcommands] = GCIQLSettings()
+    gcbc: Annotated[GCBCOptions, tyro.conf.AvoidSubcommands] = GCBCOptions()
+    gciql: Annotated[GCIQLOptions, tyro.conf.AvoidSubcommands] = GCIQLOptions()
     training: PretrainConfig = PretrainConfig()
     precision: Precision = Field(
         'float32', description='of matrix products; auto is bfloat16 where the device gains by it'
@@ -69,12 +69,14 @@ class PretrainSettings(RunSettings):
     @property
     def agent_settings(self) -> dict[str, Any]:
         """Settings of the chosen agent other than its units."""
-        return getattr(self, self.agent).model_dump(exclude={'hidden'})
+        return getattr(self, self.agent).model_dump()
 
     @model_validator(mode='after')
-    def _units_in_one_place(self) -> Self:
-        if 'hidden' in getattr(self, self.agent).model_dump(exclude_defaults=True):
-            raise ValueError(f'{self.agent}.hidden has no effect here; set hidden')
+    def _settings_are_of_the_agent(self) -> Self:
+        for name in get_args(AgentName):
+            given = getattr(self, name)
+            if name != self.agent and given != type(given)():
+                raise ValueError(f'agent is {self.agent}: the settings of {name} have no effect')
         return self
 
 

@@ -10,7 +10,8 @@ import sys
 import threading
 from typing import Annotated, Any
 
-from metagcttt_core import MetaConfig, TTTConfig
+from metagcttt_core import MetaConfig
+from metagcttt_core.adaptation import TTTSettings
 from metagcttt_core.config import Settings
 from metagcttt_core.files import write_json
 from pydantic import Field, model_validator
@@ -156,7 +157,7 @@ class Study:
         **different: Any,
     ) -> EvaluateSettings:
         values = preset_values(self.settings.base, 'evaluate')
-        values |= {'ttt': TTTConfig.model_validate(values.get('ttt', {}) | (ttt or {}))}
+        values |= {'ttt': TTTSettings.model_validate(values.get('ttt', {}) | (ttt or {}))}
         values |= {'checkpoints': tuple(checkpoints), 'processes': self.settings.processes}
         values |= {'out': self.settings.out / f'{name}.json', 'resume': True, **different}
         return EvaluateSettings.model_validate(values)
