@@ -53,7 +53,7 @@ class TTTSettings(TTTLoopConfig):
 
     def with_steps(self, steps: int) -> 'TTTConfig':
         """The settings with a budget of K gradient steps."""
-        return TTTConfig(**self.model_dump(), steps=steps)
+        return TTTConfig(**{**self.model_dump(), 'steps': steps})
 
 
 class TTTConfig(TTTSettings):

@@ -1,8 +1,8 @@
 """Settings of the agents."""
 
-from typing import Literal, TYPE_CHECKING
+from typing import Literal, Self, TYPE_CHECKING
 
-from pydantic import Field, PositiveInt
+from pydantic import Field, model_validator, PositiveInt
 
 from metagcttt_core.agents.registry import AGENTS
 from metagcttt_core.config.settings import Settings
@@ -15,12 +15,9 @@ else:
 ActorLoss = Literal['ddpgbc', 'awr', 'bc']
 
 
-class AgentSettings(Settings):
-    """Settings that all agents share."""
+class AgentOptions(Settings):
+    """Settings that all agents share, other than the size of their networks."""
 
-    hidden: tuple[PositiveInt, ...] = Field(
-        (512, 512, 512), min_length=1, description='units of each hidden layer'
-    )
     const_std: bool = Field(
         True, description='unit standard deviation of the actor (else learned)'
     )
@@ -28,14 +25,28 @@ class AgentSettings(Settings):
     goals: GoalConfig = GoalConfig()
 
 
-class GCBCSettings(AgentSettings):
-    """Settings of GCBC: actor goals are later states of the trajectory; no value goals."""
+class AgentSettings(AgentOptions):
+    """All settings of an agent."""
+
+    hidden: tuple[PositiveInt, ...] = Field(
+        (512, 512, 512), min_length=1, description='units of each hidden layer'
+    )
+
+
+class GCBCOptions(AgentOptions):
+    """Options of GCBC: actor goals are later states of the trajectory; no value goals."""
 
     goals: GoalConfig = GoalConfig(value=None)
 
+    @model_validator(mode='after')
+    def _goals_are_the_actor_s(self) -> Self:
+        if self.goals != GoalConfig(value=None, actor=self.goals.actor):
+            raise ValueError('goals.value and goals.gc_negative have no effect on GCBC')
+        return self
 
-class GCIQLSettings(AgentSettings):
-    """Settings of GCIQL."""
+
+class GCIQLOptions(AgentOptions):
+    """Options of GCIQL."""
 
     actor_loss: ActorLoss = Field('ddpgbc', description='policy extraction')
     alpha: float = Field(
@@ -43,3 +54,11 @@ class GCIQLSettings(AgentSettings):
     )
     expectile: float = Field(0.9, gt=0, lt=1, description='of the value regression')
     tau: float = Field(0.005, gt=0, le=1, description='rate of the target critics')
+
+
+class GCBCSettings(GCBCOptions, AgentSettings):
+    """All settings of GCBC."""
+
+
+class GCIQLSettings(GCIQLOptions, AgentSettings):
+    """All settings of GCIQL."""

@@ -19,7 +19,7 @@ from metagcttt_core.retrieval.trajectory_filter import TrajectoryFilter
 from metagcttt_core.training.optimizers import make_optimizer
 from metagcttt_core.training.run import TrainingRun
 
-TASKS, UPDATE = 'tasks', 'update'
+INDEX, TASKS, UPDATE = 'index', 'tasks', 'update'
 """Names of the ranges that `torch.profiler` sees."""
 
 
@@ -59,9 +59,9 @@ def post_train(
     """
     base = agent.clone()
     run = run or TrainingRun('post_train', {})
-    sampler = TaskSampler(
-        TrajectoryFilter(dataset, config.filter), config.test_fraction, config.max_test
-    )
+    with record_function(INDEX):
+        trajectory_filter = TrajectoryFilter(dataset, config.filter)
+    sampler = TaskSampler(trajectory_filter, config.test_fraction, config.max_test)
     meta_update = META_UPDATES[config.algorithm]
     outer_optimizer = None
     if config.algorithm in GRADIENT_UPDATES or config.algorithm in META_UPDATES.plugins:

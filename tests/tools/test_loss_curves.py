@@ -1,5 +1,6 @@
 """Loss curves: the very losses of an adaptation, by part, and what a run logged."""
 
+import dataclasses
 import json
 
 from metagcttt_core import adapt, FilterConfig, save_checkpoint, TrajectoryFilter, TTTConfig
@@ -36,6 +37,15 @@ def test_losses_are_those_of_the_adaptation(name, actor_only, query):
     if name == 'gciql':
         parts = ('actor',) if actor_only else ('actor', 'critic', 'value')
         np.testing.assert_allclose(losses['total'], sum(np.array(losses[p]) for p in parts), 1e-5)
+
+
+def test_support_too_small_to_adapt_on_is_refused(query):
+    dataset, support, goal = query
+    config = TTTConfig(steps=2, early_stopping=True)
+    nothing = dataclasses.replace(support, indices=support.indices[:0])
+    for settings in (config, config.model_copy(update={'early_stopping': False})):
+        with pytest.raises(ValueError, match='the filtered dataset is'):
+            adaptation_losses(tiny_agent(), dataset, nothing, goal, settings)
 
 
 def test_roughness_is_the_mean_change_over_the_range():

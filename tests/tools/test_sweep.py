@@ -112,6 +112,11 @@ def test_a_wrong_arm_is_refused_before_anything_runs(preset, arm, message):
         study_of(preset, arms={'typo': {'meta': arm}})
 
 
+def test_an_adaptation_cannot_set_steps_that_budgets_set(preset):
+    with pytest.raises(ValueError, match="TTTSettings has no setting 'steps'"):
+        study_of(preset, adaptations={'long': {'steps': 200}})
+
+
 def test_curve_must_fit_the_snapshots(preset):
     with pytest.raises(ValueError, match='multiples of its first fraction'):
         study_of(preset, curve=[0.5, 0.75])

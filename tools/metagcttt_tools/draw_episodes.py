@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from metagcttt_core import FilterConfig, TrajectoryDataset, TrajectoryFilter, TTTConfig
+from metagcttt_core import FilterConfig, TrajectoryDataset, TrajectoryFilter
+from metagcttt_core.adaptation import TTTSettings
 from metagcttt_core.config import Settings
 import numpy as np
 from pydantic import Field
@@ -35,7 +36,7 @@ class DrawSettings(Settings):
     budgets: tuple[int, ...] = Field(
         (0, 50), min_length=1, max_length=6, description='numbers of gradient steps K'
     )
-    ttt: TTTConfig = Field(TTTConfig(), description='test-time training (steps come from budgets)')
+    ttt: TTTSettings = Field(TTTSettings(), description='test-time training')
     filter: FilterConfig = FilterConfig(variant='gcttt')
     seed: int = Field(0, ge=0, description='random seed of starts, goals and adaptations')
     out: Path = Field(Path('out/episodes'), description='files to write, without suffix')
@@ -66,7 +67,7 @@ def _run(settings: DrawSettings) -> None:
         arms: dict[str, list[Episode]] = {}
         with tqdm(total=len(tasks) * len(settings.budgets), unit='episode') as bar:
             for budget in settings.budgets:
-                ttt = settings.ttt.model_copy(update={'steps': budget})
+                ttt = settings.ttt.with_steps(budget)
                 arms[f'K = {budget}'] = episodes = []
                 for task in tasks:
                     episodes.append(

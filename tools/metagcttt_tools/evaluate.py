@@ -13,8 +13,8 @@ from metagcttt_core import (
     success_statistics,
     TrajectoryDataset,
     TrajectoryFilter,
-    TTTConfig,
 )
+from metagcttt_core.adaptation import TTTSettings
 from metagcttt_core.agents.config import ActorLoss
 from metagcttt_core.config import Settings
 from metagcttt_core.files import write_json
@@ -49,7 +49,7 @@ class EpisodeSettings(Settings):
     budgets: tuple[int, ...] = Field(
         (0, 10, 20, 50, 100, 200), min_length=1, description='numbers of gradient steps K'
     )
-    ttt: TTTConfig = Field(TTTConfig(), description='test-time training (steps come from budgets)')
+    ttt: TTTSettings = Field(TTTSettings(), description='test-time training')
     filter: FilterConfig = FilterConfig()
     episodes: int = Field(10, ge=1, description='episodes per task and seed')
     seeds: tuple[int, ...] = Field((0, 1, 2), min_length=1, description='evaluation seeds')
@@ -249,7 +249,7 @@ def _success_rate(job: Job) -> float:
             changes=_Worker.settings.model_dump(include={'actor_loss'}, exclude_none=True),
         ),
         simulator,
-        ttt=_Worker.settings.ttt.model_copy(update={'steps': budget}),
+        ttt=_Worker.settings.ttt.with_steps(budget),
         episodes=_Worker.settings.episodes,
         tasks=[task],
         seed=seed,

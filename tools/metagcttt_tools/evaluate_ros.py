@@ -6,7 +6,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from metagcttt_core import FilterConfig, TTTConfig
+from metagcttt_core import FilterConfig
+from metagcttt_core.adaptation import TTTSettings
 from metagcttt_core.files import write_json
 import numpy as np
 from pydantic import Field, model_validator
@@ -64,10 +65,10 @@ class EvaluateRosSettings(EpisodeSettings):
     @model_validator(mode='after')
     def _must_be_parameters(self) -> EvaluateRosSettings:
         """Refuse settings for which policy_node has no parameter."""
-        ttt = self.ttt.model_dump(include=set(_TTT_PARAMETERS) | {'steps'})
+        ttt = self.ttt.model_dump(include=set(_TTT_PARAMETERS))
         filtering = self.filter.model_dump(include=set(_FILTER_PARAMETERS))
         for name, given, possible in (
-            ('ttt', self.ttt, TTTConfig(**ttt)),
+            ('ttt', self.ttt, TTTSettings(**ttt)),
             ('filter', self.filter, FilterConfig(**filtering)),
         ):
             default = possible.model_dump()

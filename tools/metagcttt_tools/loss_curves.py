@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from metagcttt_core import FilterConfig, TrajectoryDataset, TrajectoryFilter, TTTConfig
+from metagcttt_core.adaptation.config import TTTLoopConfig
 from metagcttt_core.agents.config import ActorLoss
 from metagcttt_core.config import Settings
 from metagcttt_core.retrieval.support import SupportSet
@@ -36,6 +37,12 @@ _PANELS = ('total', 'actor', 'critic', 'value')
 _SQUARED = ('critic', 'value')  # never negative, and over orders of magnitude
 
 
+class LossCurvesTTT(TTTLoopConfig):
+    """One adaptation, with each of the learning rates."""
+
+    steps: int = Field(200, ge=1, description='gradient steps K')
+
+
 class LossCurvesSettings(Settings):
     """Settings of the program."""
 
@@ -48,9 +55,7 @@ class LossCurvesSettings(Settings):
     lrs: tuple[float, ...] = Field(
         (3e-5, 1e-4, 3e-4), min_length=1, description='inner learning rates'
     )
-    ttt: TTTConfig = Field(
-        TTTConfig(steps=200), description='test-time training (its rate comes from lrs)'
-    )
+    ttt: LossCurvesTTT = Field(LossCurvesTTT(), description='test-time training')
     actor_loss: ActorLoss | None = Field(
         None, description='actor loss to adapt a GCIQL policy with; its own by default'
     )
@@ -93,15 +98,13 @@ def test_time_curves(settings: LossCurvesSettings) -> Curves:
     with make_simulator(str(agent.metadata['environment'])) as simulator:
         observation, goal = simulator.reset(task_id=settings.task, seed=settings.seed)
     support = trajectory_filter.query(observation, goal, agent.value_fn)
-    if not len(support.indices):
-        raise ValueError(f'the filtered dataset of task {settings.task} is empty')
     return {
         f'lr {lr:g}': adaptation_losses(
             agent,
             trajectory_filter.dataset,
             support,
             goal,
-            settings.ttt.model_copy(update={'lr': lr}),
+            TTTConfig(**settings.ttt.model_dump(), lr=lr),
             settings.seed,
         )
         for lr in settings.lrs
@@ -116,16 +119,22 @@ def adaptation_losses(
     config: TTTConfig,
     seed: int = 0,
 ) -> dict[str, list[float]]:
-    """The losses before each step of an adaptation, `total` and by part."""
+    """The losses before each step of an adaptation, `total` and by part.
+
+    Raises:
+        ValueError: If the support is too small to adapt on.
+    """
     from metagcttt_core import adapt
 
     losses: dict[str, list[float]] = {}
 
-    def collect(step: int, parts: Mapping[str, Tensor]) -> None:
+    def keep(step: int, parts: Mapping[str, Tensor]) -> None:
         for name, value in parts.items():
             losses.setdefault(name, []).append(float(value))
 
-    adapt(agent, dataset, support, goal, config, seed, on_step=collect)
+    result = adapt(agent, dataset, support, goal, config, seed, on_step=keep)
+    if not losses:
+        raise ValueError(result.reason)
     return losses
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Self, TYPE_CHECKING
 
 from metagcttt_core import DatasetError, TrajectoryDataset
 from metagcttt_core.agents import AgentName, AGENTS
-from metagcttt_core.agents.config import GCBCSettings, GCIQLSettings
+from metagcttt_core.agents.config import GCBCOptions, GCIQLOptions
 from metagcttt_core.plugins import PluginError
 from metagcttt_core.training.config import Precision, PretrainConfig
 from pydantic import create_model, Field, model_validator
@@ -45,8 +45,8 @@ class PretrainSettings(RunSettings):
     out: Path = Field(Path('out/pretrain'), description='folder of the run')
     agent: AgentName = Field('gcbc', description='kind of agent')
     hidden: tuple[int, ...] = Field((512, 512, 512), description='units of each hidden layer')
-    gcbc: Annotated[GCBCSettings, tyro.conf.AvoidSubcommands] = GCBCSettings()
-    gciql: Annotated[GCIQLSettings, tyro.conf.AvoidSubcommands] = GCIQLSettings()
+    gcbc: Annotated[GCBCOptions, tyro.conf.AvoidSubcommands] = GCBCOptions()
+    gciql: Annotated[GCIQLOptions, tyro.conf.AvoidSubcommands] = GCIQLOptions()
     training: PretrainConfig = PretrainConfig()
     precision: Precision = Field(
         'float32', description='of matrix products; auto is bfloat16 where the device gains by it'
@@ -75,11 +75,17 @@ class PretrainSettings(RunSettings):
         return getattr(self, self.agent).model_dump(exclude={'hidden'})
 
     @model_validator(mode='after')
-    def _units_in_one_place(self) -> Self:
+    def _settings_are_of_the_agent(self) -> Self:
         if self.agent not in type(self).model_fields:
             AGENTS.find(self.agent)  # says why it cannot be loaded
-        if 'hidden' in getattr(self, self.agent).model_dump(exclude_defaults=True):
-            raise ValueError(f'{self.agent}.hidden has no effect here; set hidden')
+        for name in AGENTS:
+            given = getattr(self, name, None)
+            if given is None:  # of a package that cannot be loaded
+                continue
+            if name != self.agent and given != type(given)():
+                raise ValueError(f'agent is {self.agent}: the settings of {name} have no effect')
+            if 'hidden' in given.model_dump(exclude_defaults=True):
+                raise ValueError(f'{name}.hidden has no effect here; set hidden')
         return self
 
 

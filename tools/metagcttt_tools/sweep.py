@@ -10,7 +10,8 @@ import sys
 import threading
 from typing import Annotated, Any
 
-from metagcttt_core import MetaConfig, TTTConfig
+from metagcttt_core import MetaConfig
+from metagcttt_core.adaptation import TTTSettings
 from metagcttt_core.config import Settings
 from pydantic import Field, model_validator
 from tqdm import tqdm
@@ -184,7 +185,7 @@ class Study:
         **different: Any,
     ) -> tuple[EvaluateSettings, Sequence[Policy]]:
         values = preset_values(self.settings.base, 'evaluate')
-        values |= {'ttt': TTTConfig.model_validate(values.get('ttt', {}) | (ttt or {}))}
+        values |= {'ttt': TTTSettings.model_validate(values.get('ttt', {}) | (ttt or {}))}
         values |= {'checkpoints': checkpoints(policies), 'processes': self.settings.processes}
         values |= {'out': self.settings.out / f'{name}.json', 'resume': True, **different}
         return EvaluateSettings.model_validate(values), policies

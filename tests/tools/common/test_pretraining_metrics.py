@@ -1,6 +1,7 @@
 """What a pre-training run shows while it runs, and that looking changes nothing."""
 
 import json
+import re
 
 from metagcttt_core import Agent, load_checkpoint, TrajectoryDataset
 from metagcttt_core.data import GoalRelabeller
@@ -114,10 +115,18 @@ def test_settings_of_the_agent_reach_the_policy(data, tmp_path):
     assert settings.goals.actor.p_randomgoal == 0.5
 
 
-def test_units_are_set_in_one_place(data, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ('flags', 'message'),
+    [
+        (('--gciql.hidden', '32'), 'Unrecognized options: --gciql.hidden'),
+        (('--gcbc.discount', '0.9'), 'agent is gciql: the settings of gcbc have no effect'),
+        (('--agent', 'gcbc', '--gcbc.goals.no-gc-negative'), 'goals.gc_negative have no effect'),
+    ],
+)
+def test_settings_without_effect_are_refused(flags, message, data, tmp_path, capsys):
     with pytest.raises(SystemExit, match='2'):
-        train(data, tmp_path / 'run', '--gciql.hidden', '32', '32')
-    assert 'gciql.hidden has no effect here; set hidden' in capsys.readouterr().err
+        train(data, tmp_path / 'run', *flags)
+    assert message in re.sub(r'[\s│]+', ' ', capsys.readouterr().err)
 
 
 def test_validation_draws_from_its_own_data_and_repeats(data):

@@ -93,8 +93,7 @@ class MetaBenchmark(Benchmark):
             )
             ours += np.diff(ends).tolist()  # without the first, which builds the filter's index
             plain += [seconds(plain_step) for _ in ends]
-        index_s = seconds(partial(TrajectoryFilter, dataset, self.meta.filter))
-        parts = parts_of(partial(post_train, agent, dataset, self.meta, self.seed), index_s)
+        parts = parts_of(partial(post_train, agent, dataset, self.meta, self.seed))
         step_s, plain_s = float(np.median(ours)), float(np.median(plain))
         outer = {
             'outer steps per second': 1 / step_s,
@@ -190,17 +189,16 @@ def plain_outer_step(
     return outer_step
 
 
-def parts_of(post_train: Callable[..., Any], index_s: float) -> list[dict[str, Any]]:
+def parts_of(post_train: Callable[..., Any]) -> list[dict[str, Any]]:
     """Milliseconds of each part of an outer step, as `torch.profiler` sees it.
 
     Args:
         post_train: Runs some outer steps; takes `on_step`.
-        index_s: Time it takes to build the filter's index, which belongs to no step.
     """
     from metagcttt_core.adaptation.batches import BATCHES
     from metagcttt_core.adaptation.inner_loop import INNER_STEP, TEST_LOSS
     from metagcttt_core.meta import OuterStep
-    from metagcttt_core.meta.post_train import TASKS, UPDATE
+    from metagcttt_core.meta.post_train import INDEX, TASKS, UPDATE
     from torch.profiler import profile, ProfilerActivity
 
     steps: list[OuterStep] = []
@@ -223,7 +221,7 @@ def parts_of(post_train: Callable[..., Any], index_s: float) -> list[dict[str, A
         'test losses': ranges.get(TEST_LOSS, 0.0),
         'update': ranges[UPDATE],
     }
-    total = 1e3 * (ends[-1] - began - index_s)
+    total = 1e3 * (ends[-1] - began) - ranges[INDEX]  # which belongs to no step
     parts['rest'] = total - sum(parts.values())
     return [
         {'part': name, 'ms': part / len(steps), 'share': f'{part / total:.1%}'}
