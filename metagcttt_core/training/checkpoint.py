@@ -131,13 +131,12 @@ def load_checkpoint(
             message names what.
     """
     folder = _folder(path)
-    index = _read_index(folder)
+    index, tensors = _read(folder)
     trained_for = index.metadata.get('environment')
     if environment is not None and trained_for != environment:
         raise CheckpointError(
             f'{folder}: trained for environment {trained_for!r}, not for {environment!r}'
         )
-    tensors = _read_tensors(folder, index)
     if index.agent not in AGENTS:
         raise CheckpointError(
             f'{folder}: unknown agent {index.agent!r}; known: {", ".join(AGENTS)}'
@@ -192,10 +191,9 @@ def load_training_state(path: str | Path) -> TrainingState:
         CheckpointError: If there is no checkpoint or it was saved without a training state.
     """
     folder = _folder(path)
-    index = _read_index(folder)
+    index, tensors = _read(folder)
     if index.training is None:
         raise CheckpointError(f'{folder}: was saved without a training state, cannot be resumed')
-    tensors = _read_tensors(folder, index)
     for name in tensors:
         if not name.startswith(('agent.', 'optimizer.', 'pretraining.')):
             raise CheckpointError(f'{folder}: unknown tensor {name}')
@@ -258,12 +256,19 @@ def _read_index(folder: Path) -> _Index:
         raise CheckpointError(f'{file}: {"; ".join(error_lines(error))}') from error
 
 
-def _read_tensors(folder: Path, index: _Index) -> dict[str, Tensor]:
-    file = folder / index.weights
-    try:
-        content = file.read_bytes()
-    except FileNotFoundError as error:
-        raise CheckpointError(f'{file}: is missing') from error
+def _read(folder: Path) -> tuple[_Index, dict[str, Tensor]]:
+    """The index and the tensors of one and the same save, even while the next one replaces it."""
+    while True:
+        index = _read_index(folder)
+        file = folder / index.weights
+        try:
+            return index, _tensors(file, file.read_bytes())
+        except FileNotFoundError as error:
+            if _read_index(folder).weights == index.weights:
+                raise CheckpointError(f'{file}: is missing') from error
+
+
+def _tensors(file: Path, content: bytes) -> dict[str, Tensor]:
     if f'weights-{hashlib.sha256(content).hexdigest()[:16]}.safetensors' != file.name:
         raise CheckpointError(
             f'{file}: is damaged, its content does not match the hash in its name'

@@ -18,7 +18,13 @@ from tqdm import tqdm
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.resume import nested, Resumable
 from metagcttt_tools.common.run_log import RunLog
-from metagcttt_tools.common.session import provenance, stop_on_signal, use_threads, write_settings
+from metagcttt_tools.common.session import (
+    provenance,
+    sole_writer,
+    stop_on_signal,
+    use_threads,
+    write_settings,
+)
 from metagcttt_tools.controller.config import SACConfig
 
 if TYPE_CHECKING:
@@ -104,7 +110,9 @@ class ControllerTraining:
             if done > settings.random_steps and done % settings.update_every == 0:
                 batch = replay.sample(settings.sac.batch_size, rng)
                 self.learner.scale_lr(self._lr_share(step))
-                meters.losses = self.learner.update(batch, rng)
+                number = done // settings.update_every
+                actor = number % settings.sac.actor_every == 0
+                meters.losses |= self.learner.update(batch, rng, actor=actor)
             if done % settings.log_every == 0:
                 log(done, meters.read())
             stopping = should_stop()
@@ -196,7 +204,8 @@ def main(argv: list[str] | None = None) -> None:
     settings = parse(TrainControllerSettings, _DESCRIPTION, 'controller train', argv)
     use_threads(settings.threads)
     try:
-        _run(settings)
+        with sole_writer(settings.out):
+            _run(settings)
     except ValueError as error:
         fail(str(error))
 

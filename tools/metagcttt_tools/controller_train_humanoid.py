@@ -9,7 +9,7 @@ from tqdm import tqdm
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.resume import Resumable
 from metagcttt_tools.common.run_log import RunLog
-from metagcttt_tools.common.session import stop_on_signal, use_threads, write_settings
+from metagcttt_tools.common.session import sole_writer, stop_on_signal, use_threads, write_settings
 
 _DESCRIPTION = """Train the controller that walks the humanoid along a direction (SAC).
 
@@ -37,7 +37,8 @@ def main(argv: list[str] | None = None) -> None:
     settings = parse(TrainHumanoidSettings, _DESCRIPTION, 'controller train-humanoid', argv)
     use_threads(settings.threads)
     try:
-        _run(settings)
+        with sole_writer(settings.out):
+            _run(settings)
     except ValueError as error:
         fail(str(error))
 

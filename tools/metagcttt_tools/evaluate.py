@@ -27,7 +27,7 @@ from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.job_log import JobLog
 from metagcttt_tools.common.results import markdown_table
 from metagcttt_tools.common.resume import Resumable
-from metagcttt_tools.common.session import provenance, use_threads
+from metagcttt_tools.common.session import provenance, sole_writer, use_threads
 
 _DESCRIPTION = """Success of policies by test-time training budget.
 
@@ -85,7 +85,8 @@ def main(argv: list[str] | None = None) -> None:
     """Run the program."""
     settings = parse(EvaluateSettings, _DESCRIPTION, 'evaluate', argv)
     try:
-        results = evaluate(settings, settings)
+        with sole_writer(settings.out):
+            results = evaluate(settings, settings)
     except ValueError as error:
         fail(str(error))
     except KeyboardInterrupt:
@@ -183,7 +184,8 @@ def _run_jobs(settings: EvaluateSettings, program: Resumable, jobs: list[Job]) -
             pretrained_state(policy)  # refuses those without one before anything runs
     decisive = settings.decisive()
     decisive['dataset'] = TrajectoryDataset.load(settings.dataset).fingerprint
-    decisive['policies'] = [policy.fingerprint() for policy in policies]
+    fingerprints = [policy.fingerprint() for policy in policies]
+    decisive['policies'] = fingerprints
     log: JobLog[Job] = JobLog(
         finished_jobs(settings.out),
         {'decisive': decisive, 'program': program.model_dump(mode='json')},
@@ -193,7 +195,7 @@ def _run_jobs(settings: EvaluateSettings, program: Resumable, jobs: list[Job]) -
         settings.processes,
         mp_context=multiprocessing.get_context('spawn'),
         initializer=_start_worker,
-        initargs=(settings,),
+        initargs=(settings, dict(zip(map(str, settings.checkpoints), fingerprints, strict=True))),
     )
     todo = [job for job in jobs if job not in log.finished]
     with tqdm(total=len(jobs), initial=len(jobs) - len(todo), unit='job', desc='evaluate') as bar:
@@ -226,28 +228,30 @@ class _Worker:
     """State that a worker process loads once."""
 
     settings: EvaluateSettings
+    fingerprints: Mapping[str, str]
     trajectory_filter: TrajectoryFilter
 
 
-def _start_worker(settings: EvaluateSettings) -> None:
+def _start_worker(settings: EvaluateSettings, fingerprints: Mapping[str, str]) -> None:
     use_threads(1)
     _Worker.settings = settings
+    _Worker.fingerprints = fingerprints
     _Worker.trajectory_filter = TrajectoryFilter(
         TrajectoryDataset.load(settings.dataset), settings.filter
     )
 
 
 def _success_rate(job: Job) -> float:
-    from metagcttt_core import evaluate_success, load_checkpoint
+    from metagcttt_core import CheckpointError, evaluate_success, load_checkpoint
 
     path, environment, budget, seed, task = job
+    changes = _Worker.settings.model_dump(include={'actor_loss'}, exclude_none=True)
+    policy = load_checkpoint(path, environment=environment, changes=changes)
+    if policy.fingerprint() != _Worker.fingerprints[path]:
+        raise CheckpointError(f'{path}: was replaced while it was evaluated')
     simulator = make_simulator(environment)
     result = evaluate_success(
-        load_checkpoint(
-            path,
-            environment=environment,
-            changes=_Worker.settings.model_dump(include={'actor_loss'}, exclude_none=True),
-        ),
+        policy,
         simulator,
         ttt=_Worker.settings.ttt.with_steps(budget),
         episodes=_Worker.settings.episodes,

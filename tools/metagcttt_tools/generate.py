@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.resume import Resumable
+from metagcttt_tools.common.session import sole_writer
 
 DESCRIPTION = """Generate an offline dataset of a maze in OGBench's npz format.
 
@@ -95,7 +96,8 @@ def main(argv: list[str] | None = None) -> None:
     """Run the program."""
     settings = parse(GenerateSettings, DESCRIPTION, 'generate', argv)
     try:
-        _run(settings)
+        with sole_writer(settings.file):
+            _run(settings)
     except ValueError as error:
         fail(str(error))
     except KeyboardInterrupt:

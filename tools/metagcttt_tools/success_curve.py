@@ -13,7 +13,7 @@ from pydantic import Field
 
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.results import markdown_table, write_report
-from metagcttt_tools.common.session import snapshot_folder, SNAPSHOTS
+from metagcttt_tools.common.session import snapshot_folder, SNAPSHOTS, sole_writer
 from metagcttt_tools.evaluate import evaluate, EvaluateSettings, ProtocolSettings
 
 if TYPE_CHECKING:
@@ -52,7 +52,8 @@ def main(argv: list[str] | None = None) -> None:
             ),
             **settings.model_dump(exclude={'runs'}),
         )
-        results = evaluate(evaluation, settings)
+        with sole_writer(settings.out):
+            results = evaluate(evaluation, settings)
     except ValueError as error:
         fail(str(error))
     except KeyboardInterrupt:

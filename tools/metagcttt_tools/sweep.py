@@ -24,6 +24,7 @@ from metagcttt_tools.common.session import (
     provenance,
     RunSettings,
     snapshot_folder,
+    sole_writer,
     stop_on_signal,
 )
 from metagcttt_tools.evaluate import EvaluateSettings
@@ -83,7 +84,8 @@ def main(argv: list[str] | None = None) -> None:
     settings = parse(SweepSettings, _DESCRIPTION, 'sweep', argv)
     try:
         study = Study(settings)
-        study.run()
+        with sole_writer(settings.out):
+            study.run()
     except ValueError as error:
         fail(str(error))
     except KeyboardInterrupt:

@@ -2,8 +2,10 @@
 
 from contextlib import contextmanager
 import hashlib
+from itertools import count
 import json
 from pathlib import Path
+import threading
 from typing import Any
 
 from metagcttt_core import CheckpointError, files, load_checkpoint, save_checkpoint
@@ -430,3 +432,27 @@ def test_changed_settings_replace_the_saved_ones(tmp_path):
     save_checkpoint(tiny_agent('gcbc'), tmp_path)
     with pytest.raises(CheckpointError, match="GCBCSettings has no setting 'actor_loss'"):
         load_checkpoint(tmp_path, changes={'actor_loss': 'bc'})
+
+
+def test_reader_sees_one_save_while_others_replace_it(tmp_path):
+    agents = [tiny_agent(seed=seed) for seed in range(2)]
+    for agent, name in zip(agents, 'ab', strict=True):
+        agent.metadata = {'name': name}
+    save_checkpoint(agents[0], tmp_path)
+    stop = threading.Event()
+
+    def replace():
+        for number in count():
+            if stop.is_set():
+                return
+            save_checkpoint(agents[number % 2], tmp_path)
+
+    writer = threading.Thread(target=replace)
+    writer.start()
+    try:
+        for _ in range(150):
+            agent = load_checkpoint(tmp_path)
+            assert_bit_equal(agent, weights_of(agents['ab'.index(agent.metadata['name'])]))
+    finally:
+        stop.set()
+        writer.join()

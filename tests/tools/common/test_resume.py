@@ -2,10 +2,16 @@
 
 import json
 
-from metagcttt_core import load_checkpoint, TrajectoryDataset
+from metagcttt_core import (
+    CheckpointError,
+    load_checkpoint,
+    save_checkpoint,
+    TrajectoryDataset,
+)
 from metagcttt_core.training.checkpoint import steps_done
 from metagcttt_tools import evaluate, generate, meta_train, pretrain
 from metagcttt_tools.common.resume import flat, nested
+from metagcttt_tools.common.session import sole_writer
 import pytest
 from tests.core.builders import assert_bit_equal, maze_walks, weights_of
 
@@ -170,3 +176,26 @@ def test_flat_and_nested_are_inverse():
     values = {'a': 1, 'b': {'c': [1, 2], 'd': {'e': None}}, 'f': {}}
     assert flat(values) == {'a': 1, 'b.c': [1, 2], 'b.d.e': None, 'f': {}}
     assert nested(flat(values)) == values
+
+
+def test_second_writer_is_refused_while_the_first_lives(data, tmp_path, capsys):
+    out = tmp_path / 'run'
+    with sole_writer(out):
+        with pytest.raises(SystemExit, match='2'):
+            pretrained(data, out)
+        assert f'{out}: another process is writing there' in capsys.readouterr().err
+    pretrained(data, out)  # whose lock nobody holds any more
+    assert steps_done(out / 'checkpoint') == 6
+
+
+def test_policy_that_is_replaced_while_it_is_evaluated_is_refused(data, tmp_path):
+    base = pretrained(data, tmp_path / 'base') / 'checkpoint'
+    settings = evaluate.EvaluateSettings(checkpoints=(base,), dataset=data, episodes=1)
+    fingerprint = load_checkpoint(base).fingerprint()
+    evaluate._start_worker(settings, {str(base): fingerprint})
+    job = (str(base), 'pointmaze-medium-v0', 0, 0, 1)
+    assert evaluate._success_rate(job) in (0, 1)
+    other = load_checkpoint(pretrained(data, tmp_path / 'other', seed=1) / 'checkpoint')
+    save_checkpoint(other, base)
+    with pytest.raises(CheckpointError, match='was replaced while it was evaluated'):
+        evaluate._success_rate(job)

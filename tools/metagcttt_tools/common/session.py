@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -15,6 +15,7 @@ import sys
 import threading
 from typing import Any, ClassVar, TYPE_CHECKING
 
+from filelock import FileLock, Timeout
 from metagcttt_core.config import Settings
 from metagcttt_core.files import write_json
 from pydantic import Field, field_validator
@@ -84,6 +85,28 @@ class Session:
 
 
 @contextmanager
+def sole_writer(path: Path) -> Iterator[None]:
+    """Keeps other processes from writing to the same results.
+
+    The lock is the kernel's (on network file systems the server's), so it ends with its holder,
+    however that ends.
+
+    Args:
+        path: The folder or file of the results; its lock lies beside it.
+
+    Raises:
+        SystemExit: With status 2 if another process writes there.
+    """
+    lock = path.parent / f'.{path.name}.lock'
+    lock.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(lock, timeout=0):
+            yield
+    except Timeout:
+        fail(f'{path}: another process is writing there; wait for its end or choose another place')
+
+
+@contextmanager
 def training_session(
     settings: RunSettings, stage: str, decisive: dict[str, Any], steps: int
 ) -> Iterator[Session]:
@@ -102,25 +125,23 @@ def training_session(
             with status 2 when something cannot be written, the last checkpoint being left whole.
     """
     from metagcttt_core.meta.parallel import any_process, first_process
-    from metagcttt_core.training.checkpoint import has_checkpoint, steps_done
     from metagcttt_core.training.run import TrainingInterrupted, TrainingRun
     import torch
 
     folder = settings.checkpoint_folder
-    if has_checkpoint(folder) and not settings.resume:
-        fail(f'{folder} holds a checkpoint: pass --resume to continue, or choose another --out')
-    first = steps_done(folder)
-    if first > steps:
-        fail(f'{folder}: has {first} steps already, {steps} were asked for')
     writes = first_process()
     try:
-        if writes:
-            write_settings(settings.out, settings)
-        with (
-            stop_on_signal() as stop,
-            RunLog(settings.out, first) if writes else SilentLog() as log,
-            tqdm(total=steps, initial=first, unit='step', desc=stage, disable=not writes) as bar,
-        ):
+        with ExitStack() as stack:
+            if writes:
+                stack.enter_context(sole_writer(settings.out))
+            first = _steps_to_continue_from(settings, steps)
+            if writes:
+                write_settings(settings.out, settings)
+            stop = stack.enter_context(stop_on_signal())
+            log = stack.enter_context(RunLog(settings.out, first) if writes else SilentLog())
+            bar = stack.enter_context(
+                tqdm(total=steps, initial=first, unit='step', desc=stage, disable=not writes)
+            )
             run = TrainingRun(
                 stage,
                 decisive,
@@ -144,6 +165,19 @@ def training_session(
 def snapshot_folder(run: Path, step: int) -> Path:
     """The folder in which a run keeps its policy after `step` steps."""
     return run / SNAPSHOTS / f'{step:06d}'
+
+
+def _steps_to_continue_from(settings: RunSettings, steps: int) -> int:
+    """Steps that the run in its folder has done; ends the process where it cannot be continued."""
+    from metagcttt_core.training.checkpoint import has_checkpoint, steps_done
+
+    folder = settings.checkpoint_folder
+    if has_checkpoint(folder) and not settings.resume:
+        fail(f'{folder} holds a checkpoint: pass --resume to continue, or choose another --out')
+    first = steps_done(folder)
+    if first > steps:
+        fail(f'{folder}: has {first} steps already, {steps} were asked for')
+    return first
 
 
 def left_behind(settings: RunSettings) -> str:

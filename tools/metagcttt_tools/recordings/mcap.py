@@ -110,8 +110,12 @@ def read_messages(path: Path, type_names: Collection[str]) -> RecordedMessages:
         raise DatasetError(f'{path}: cannot be read ({error})') from error
     except InvalidMagic as error:
         raise DatasetError(f'{path}: not an MCAP file') from error
-    # What the packages raise for damaged records and messages, besides their own errors.
-    except (McapError, ValueError, LookupError, struct.error, zstandard.ZstdError) as error:
+    # The packages raise any of these for damaged records and messages, besides their own errors;
+    # LZ4 raises RuntimeError.
+    except (
+        *(McapError, zstandard.ZstdError, RuntimeError, struct.error),
+        *(ValueError, LookupError, OverflowError, MemoryError),
+    ) as error:
         raise DatasetError(f'{path}: damaged ({error})') from error
     found.sort(key=lambda recorded: recorded.published_ns)
     return RecordedMessages(found, topics, complete)

@@ -45,6 +45,15 @@ class PolicyNode(LifecycleNode):
             if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
                 self.trigger_activate()
 
+    def _LifecycleNodeMixin__change_state(self, transition_id: int) -> TransitionCallbackReturn:
+        """Refuse a transition that there is not in this state; rclpy's own ends the process."""
+        transitions = {number for number, *_ in self._state_machine.available_transitions}
+        if transition_id in transitions:
+            return super()._LifecycleNodeMixin__change_state(transition_id)  # type: ignore[misc]
+        _, state = self._state_machine.current_state
+        self.get_logger().warning(f'refused transition {transition_id}: the node is {state}')
+        return TransitionCallbackReturn.FAILURE
+
     def destroy_node(self) -> None:
         """End the adaptation thread, then destroy the node."""
         self._close_session()
