@@ -9,7 +9,7 @@ root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 unset PYTHONPATH PYTHONHOME
-export PIP_DISABLE_PIP_VERSION_CHECK=1
+export PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_COMPILE=1 # few of the modules are used
 
 say() { printf 'wheel: %4ds %s\n' "$SECONDS" "$*"; }
 
@@ -18,12 +18,12 @@ die() {
   exit 1
 }
 
-# shellcheck source=tools/install_torch.sh
-source "$root/tools/install_torch.sh"
+# shellcheck source=tools/packages.sh
+source "$root/tools/packages.sh"
 
 # Only what is in the repository, so that neither old build outputs nor loose files get in.
 mkdir "$work"/{source,elsewhere}
-(cd "$root" && git ls-files -z pyproject.toml README.md metagcttt_core sim_bridge tools |
+(cd "$root" && git ls-files -z pyproject.toml LICENSE metagcttt_core sim_bridge tools |
   tar --create --null --files-from=-) | tar --extract --directory "$work/source"
 
 "${PYTHON:-$root/.venv/bin/python}" -m venv "$work/venv"
@@ -72,5 +72,6 @@ metagcttt meta-train --dataset mine.npz --checkpoint base/checkpoint --out meta 
 [ "$(wc -l <error)" = 1 ] && grep -q 'pip install "metagcttt-core\[mazes\]"' error ||
   die "no word of the missing extra: $(cat error)"
 install '[mazes]'
+install_ogbench "$work/venv/bin/python" -qq
 metagcttt "${evaluate[@]}"
 [ -s out/evaluation.json ] || die 'no results'
