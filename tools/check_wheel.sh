@@ -9,7 +9,7 @@ root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 unset PYTHONPATH PYTHONHOME
-export PIP_DISABLE_PIP_VERSION_CHECK=1
+export PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_COMPILE=1 # few of the modules are used
 
 say() { printf 'wheel: %4ds %s\n' "$SECONDS" "$*"; }
 
@@ -18,12 +18,12 @@ die() {
   exit 1
 }
 
-# shellcheck source=tools/install_torch.sh
-source "$root/tools/install_torch.sh"
+# shellcheck source=tools/packages.sh
+source "$root/tools/packages.sh"
 
 # Only what is in the repository, so that neither old build outputs nor loose files get in.
 mkdir "$work"/{source,elsewhere}
-(cd "$root" && git ls-files -z pyproject.toml README.md metagcttt_core sim_bridge tools |
+(cd "$root" && git ls-files -z pyproject.toml LICENSE metagcttt_core sim_bridge tools |
   tar --create --null --files-from=-) | tar --extract --directory "$work/source"
 
 "${PYTHON:-$root/.venv/bin/python}" -m venv "$work/venv"
@@ -60,17 +60,26 @@ metagcttt() {
   say "metagcttt $*"
 }
 
+refuses() { # WORDS ARGUMENT...: in one line, with these words
+  ! "$work/venv/bin/metagcttt" "${@:2}" >error 2>&1 || die "works without an extra: ${*:2}"
+  [ "$(wc -l <error)" = 1 ] && grep -qF "$1" error || die "metagcttt ${*:2}: $(cat error)"
+}
+
 evaluate=(evaluate --dataset mine.npz --checkpoints meta/checkpoint --budgets 0 1
   --episodes 1 --seeds 0 --processes 1)
 
 metagcttt --help
 metagcttt --version
+metagcttt --tyro-print-completion bash # imports every program
 metagcttt pretrain --dataset mine.npz --out base --hidden 8 --training.steps 3
 metagcttt meta-train --dataset mine.npz --checkpoint base/checkpoint --out meta \
   --meta.outer-steps 2 --meta.inner-steps 2
-! "$work/venv/bin/metagcttt" "${evaluate[@]}" 2>error || die 'evaluated without a simulator'
-[ "$(wc -l <error)" = 1 ] && grep -q 'pip install "metagcttt-core\[mazes\]"' error ||
-  die "no word of the missing extra: $(cat error)"
+refuses 'pip install "metagcttt-core[mazes]"' "${evaluate[@]}"
+refuses 'pip install "metagcttt-core[plots]"' loss-curves --dataset mine.npz
+for program in demo evaluate-ros 'benchmark ros' 'benchmark restarts'; do
+  refuses 'make setup' $program
+done
 install '[mazes]'
+install_ogbench "$work/venv/bin/python" -qq
 metagcttt "${evaluate[@]}"
 [ -s out/evaluation.json ] || die 'no results'

@@ -18,8 +18,8 @@ die() {
   exit 1
 }
 
-# shellcheck source=tools/install_torch.sh
-source "$root/tools/install_torch.sh"
+# shellcheck source=tools/packages.sh
+source "$root/tools/packages.sh"
 
 choose_ros() {
   # A Python with the ROS wheels leaves these marks on its children; they mislead another one.
@@ -75,7 +75,7 @@ find_python() {
 digest() { { printf '%s\n' "$@" && cat; } | sha256sum | cut -d' ' -f1; }
 
 packages_digest() {
-  (cd "$root" && cat constraints.txt pyproject.toml tools/{setup,install_torch}.sh tools/fix_ros_wheels.py) |
+  (cd "$root" && cat constraints.txt pyproject.toml tools/{setup,packages}.sh tools/fix_ros_wheels.py) |
     digest "$root" "$ros"
 }
 
@@ -104,9 +104,7 @@ install_packages() {
   install_torch "$venv/bin/python" --disable-pip-version-check
   say "3 of 4: packages ($(grep -c == "$root/constraints.txt") are pinned; minutes the first time)"
   "${pip[@]}" install -c "$root/constraints.txt" --no-build-isolation -e "$root[$extras]"
-  # From Python 3.13 on, a package that ogbench names and its mazes do without cannot be had.
-  "$venv/bin/python" -c 'import sys; sys.exit(sys.version_info < (3, 13))' &&
-    "${pip[@]}" install -c "$root/constraints.txt" --no-deps ogbench
+  install_ogbench "$venv/bin/python" --disable-pip-version-check
   [ "$ros" = system ] || "$venv/bin/python" "$root/tools/fix_ros_wheels.py" "$venv"
   mkdir -p "$stamps"
   echo "$root $ros" >"$stamps/made-for"

@@ -157,7 +157,8 @@ guests = guest:maze
         assert len(TrajectoryFilter(dataset, config).query(state, goal).segments) == 1
         whole = config.model_copy(update={'variant': 'paper'})
         assert len(TrajectoryFilter(dataset, whole).query(state, goal).segments) > 1
-        meta = MetaConfig(algorithm='nudge', outer_steps=2, inner_steps=1, filter=whole)
+        steps = {'outer_steps': 2, 'inner_steps': 1, 'filter': whole}
+        meta = MetaConfig(algorithm='nudge', meta_lr=0.5, **steps)
         post_train(tiny_agent('gcbc'), dataset, meta)
         assert make_simulator('guest-maze') == 'GUEST-MAZE'
         assert 'guest-maze' in environment_names() and describe_environment('guest-maze')

@@ -77,6 +77,7 @@ PROGRAMS: dict[str, Program | Group] = {
 
 # What is not part of the smallest installation, and what brings it.
 EXTRAS = {
+    'PIL': 'mazes',
     'gymnasium': 'mazes',
     'gymnasium_robotics': 'mazes',
     'h5py': 'minari',
@@ -87,7 +88,7 @@ EXTRAS = {
     'ogbench': 'mazes',
     'tensorboard': 'plots',
 }
-_ROS = frozenset({'metagcttt', 'metagcttt_interfaces', 'rclpy'})
+_ROS = frozenset({'domain_coordinator', 'metagcttt', 'metagcttt_interfaces', 'rclpy'})
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 from sim_bridge.controllers import LearnedFollower
 from sim_bridge.controllers.walk import QUARTER_TURNS_RAD, Walk, walk_along
 from sim_bridge.mazes.ogbench import open_floor
@@ -18,6 +17,8 @@ _ARROW_RGBA = np.array([0.96, 0.26, 0.33, 1.0], np.float32)
 
 def film(follower: LearnedFollower, path: Path, seed: int, duration_s: float = 10.0) -> None:
     """Write a GIF of a walk that turns by a right angle now and then."""
+    from PIL import Image
+
     walk = walk_along(follower, np.array([1.0, 0.0]), duration_s, seed, QUARTER_TURNS_RAD)
     images = [Image.fromarray(frame) for frame in draw_walk(follower.robot, walk)]
     # One palette, that keeps the colour of the small arrow too: colours shall not flicker.

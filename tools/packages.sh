@@ -1,4 +1,5 @@
-# Sourced by setup.sh and check_wheel.sh, which define `say` and `root`.
+# Packages that pip alone does not get right. Sourced by setup.sh and check_wheel.sh, which define
+# `say` and `root`.
 # shellcheck shell=bash
 
 # PyPI's builds of PyTorch bring gigabytes of CUDA along; the builds without are in its own index.
@@ -23,4 +24,10 @@ install_torch() { # PYTHON [PIP OPTION...]
     -c "$root/constraints.txt" torch; then
     say "no PyTorch for this Python in $index: it comes from pip's own index"
   fi
+}
+
+# From Python 3.13 on, the extra `mazes` leaves ogbench out; see pyproject.toml.
+install_ogbench() { # PYTHON [PIP OPTION...]
+  "$1" -c 'import sys; sys.exit(sys.version_info < (3, 13))' || return 0
+  "$1" -m pip "${@:2}" install --no-deps -c "$root/constraints.txt" ogbench
 }
