@@ -4,6 +4,7 @@
 `ddpgbc`. The values are in `paper.yaml`.
 """
 
+from functools import cache
 from importlib.resources import files
 from typing import Any, NamedTuple
 
@@ -45,6 +46,7 @@ def table3() -> list[Row]:
     return [Row(*entries) for entries in _read()['rows']]
 
 
+@cache
 def _read() -> dict[str, Any]:
     text = (files('metagcttt_tools.common') / 'paper.yaml').read_text(encoding='utf-8')
     return yaml.safe_load(text)
