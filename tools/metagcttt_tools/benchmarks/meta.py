@@ -6,11 +6,11 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 import time
-from typing import Any, TYPE_CHECKING
+from typing import Any, Self, TYPE_CHECKING
 
 from metagcttt_core import FilterConfig, MetaConfig, TrajectoryDataset, TrajectoryFilter
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 from tqdm import tqdm
 
 from metagcttt_tools.common.cli import parse
@@ -51,6 +51,16 @@ class MetaBenchmark(Benchmark):
     threads: int = Field(1, ge=1, description='threads for tensor operations')
     tasks: tuple[int, ...] = Field((2, 4, 8), description='sizes of the meta-batches')
     seed: int = Field(0, ge=0, description='of tasks and batches')
+
+    @model_validator(mode='after')
+    def _nothing_of_a_critic(self) -> Self:
+        default = FilterConfig().min_steps
+        if self.meta.actor_only or self.meta.filter.min_steps != default:
+            raise ValueError(
+                'meta.actor_only and meta.filter.min_steps have no effect on GCBC, which has no '
+                'critic'
+            )
+        return self
 
     def run(self) -> None:
         """Measure, print and write."""

@@ -1,0 +1,51 @@
+"""The data and policies of the walk over all settings."""
+
+import json
+from pathlib import Path
+import shutil
+
+from metagcttt_core import save_checkpoint, TrajectoryDataset
+from metagcttt_core.training.config import PretrainConfig
+from metagcttt_core.training.pretrain import pretrain
+import pytest
+from tests.core.builders import DATA, maze_walks, tiny_agent
+
+
+@pytest.fixture(scope='session')
+def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two datasets, two policies of each kind, and runs of pre-training with snapshots."""
+    folder = tmp_path_factory.mktemp('places')
+    walks = maze_walks()
+    walks.save(folder / 'walks.npz')
+    half = walks.num_rows // 2
+    TrajectoryDataset.from_arrays(
+        walks.observations[:half], walks.actions[:half], walks.terminals[:half]
+    ).save(folder / 'half.npz')
+    for name, kind, seed in (
+        ('gcbc', 'gcbc', 0),
+        ('gciql', 'gciql', 0),
+        ('other', 'gcbc', 1),
+        ('run-a/snapshots/000001', 'gcbc', 2),
+        ('run-b/snapshots/000001', 'gcbc', 3),
+        ('run-critic/snapshots/000001', 'gciql', 4),
+    ):
+        agent = tiny_agent(kind, seed=seed)
+        agent.metadata['environment'] = 'pointmaze-medium-v0'
+        agent = pretrain(agent, walks, PretrainConfig(steps=3, batch_size=16), seed)
+        save_checkpoint(agent, folder / name)
+    (folder / 'logged').mkdir()
+    records = [{'step': step, 'train/loss': 1.0 / step} for step in (1, 2)]
+    lines = ''.join(json.dumps(record) + '\n' for record in records)
+    (folder / 'logged' / 'metrics.jsonl').write_text(lines)
+    for name, k in (('meta-a', 1), ('meta-b', 2)):
+        (folder / name).mkdir()
+        (folder / name / 'metrics.jsonl').write_text(f'{{"step": 1, "inner/best_step": {k}}}\n')
+    for name, data in (('mazes', 'walks'), ('half-mazes', 'half')):
+        (folder / name).mkdir()
+        for kind in ('navigate', 'stitch'):
+            path = folder / name / f'pointmaze-medium-{kind}-v0.npz'
+            shutil.copy(folder / f'{data}.npz', path)
+            path.with_suffix('.json').touch()  # says that it is complete
+    for name in ('nets_gcbc_pm', 'nets_gcbc_ant', 'nets_gciql_pm'):
+        shutil.copy(DATA / f'{name}.npz', folder)
+    return folder

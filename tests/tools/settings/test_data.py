@@ -1,0 +1,312 @@
+"""Every setting of what makes data, controllers and pictures of them, or converts and packs."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
+
+from metagcttt_tools import (
+    controller_measure,
+    controller_train,
+    diagnostics,
+    download,
+    generate,
+    top_view,
+)
+from metagcttt_tools.common import plots
+from metagcttt_tools.controller import humanoid
+from metagcttt_tools.recordings import goal_views, trajectories
+import ogbench
+import pytest
+from sim_bridge.controllers.direction import BUNDLED
+from sim_bridge.controllers.walk import GoalRun
+from tests.core.builders import random_dataset
+from tests.tools.settings.walk import Proof, Seen, ShortSimulator, Walk, walks_through
+import torch.utils.tensorboard
+
+
+def watch_generation(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    def note(plan, output, *, progress, **others):
+        seen.append((plan, output, others))
+        figures = ('rows', 'validation_rows', 'goals_per_episode', 'falls_per_episode', 'coverage')
+        return SimpleNamespace(**dict.fromkeys(figures, 1.0))
+
+    patch.setattr(generate, 'generate', note)
+    patch.setattr(generate, '_draw', lambda *_: None)
+
+
+GENERATE = Walk(
+    'generate',
+    {'processes': 1},
+    {
+        'resume': True,
+        'environment': 'pointmaze-large-v0',
+        'kind': 'stitch',
+        'episodes': 7,
+        'rows_per_episode': 9,
+        'noise': 0.1,
+        'to_goal': True,
+        'seed': 1,
+        'output': 'elsewhere.npz',
+        'processes': 2,
+        'controller': 'controller',
+        'overwrite': True,
+    },
+    watch_generation,
+)
+
+
+def watch_download(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    patch.setattr(ogbench, 'download_datasets', lambda *given: seen.append(given))
+    patch.setattr(download, 'check', lambda *given: seen.append(given))
+
+
+DOWNLOAD = Walk(
+    'download', {}, {'names': ['antmaze-large-navigate-v0'], 'folder': 'elsewhere'}, watch_download
+)
+
+
+def watch_import(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    def note(*given, **named):
+        seen.append((given, named))
+        summary = SimpleNamespace(
+            states=1, actions=1, transitions=1, trajectories=1, dropped={}, unfinished=[]
+        )
+        return random_dataset(), summary
+
+    patch.setattr(trajectories, 'read_recordings', note)
+
+
+IMPORT = Walk(
+    'import-recordings',
+    {'recordings': ['a.mcap']},
+    {
+        'recordings': ['b.mcap'],
+        'out': 'elsewhere.npz',
+        'extend': '@half.npz',
+        'keep_idle': True,
+        'refuse_gaps': True,
+        'overwrite': Proof(True, again=True),
+    },
+    watch_import,
+)
+WITH_CRITIC = {'agent': 'gciql', 'file': '@nets_gciql_pm.npz'}
+CONVERT = Walk(
+    'convert',
+    {'file': '@nets_gcbc_pm.npz', 'prefix': 'init'},
+    {
+        'file': Proof('@nets_gcbc_ant.npz'),
+        'agent': Proof('gciql', refused='reference parameters do not fit a gciql agent'),
+        'environment': 'pointmaze-large-v0',
+        'discount': 0.5,
+        'actor_loss': Proof('awr', WITH_CRITIC),
+        'alpha': Proof(3.0, WITH_CRITIC),
+        'prefix': 'adam1',
+        'out': 'elsewhere',
+    },
+)
+PACK = Walk(
+    'pack-assets',
+    {'base': '@gcbc', 'meta': '@gcbc', 'dataset': '@walks.npz', 'episodes': 30},
+    {
+        'base': '@other',
+        'meta': '@other',
+        'dataset': '@half.npz',
+        'episodes': 2,
+        'optimizer_state': True,
+        'out': 'elsewhere',
+    },
+)
+
+
+def note_pictures(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    patch.setattr(plots, 'save', lambda figure, path: seen.append(path))
+
+
+def watch_diagnostics(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    def writer(folder):
+        seen.append('TensorBoard')
+        return mock.Mock()
+
+    patch.setattr(torch.utils.tensorboard, 'SummaryWriter', writer)
+    patch.setattr(diagnostics, 'PICTURES', {'one': seen.append})
+    note_pictures(patch, seen)
+
+
+DIAGNOSTICS = Walk(
+    'diagnostics',
+    {'run': '@meta-a'},
+    {'run': '@meta-b', 'out': 'elsewhere', 'tensorboard': False},
+    watch_diagnostics,
+)
+
+
+def watch_top_view(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    def read(*given):
+        seen.append(given)
+        return None, [SimpleNamespace(reached=True, query_id=number) for number in range(8)]
+
+    patch.setattr(goal_views, 'read_goal_views', read)
+    patch.setattr(top_view, 'picture', lambda maze, views: seen.append(len(views)))
+    patch.setattr(top_view, 'animate', lambda maze, *given: seen.append(given[1:]))
+    note_pictures(patch, seen)
+
+
+TOP_VIEW = Walk(
+    'top-view',
+    {'dataset': '@walks.npz'},
+    {
+        'recording': 'other.mcap',
+        'out': 'elsewhere.png',
+        'dataset': '@half.npz',
+        'robot': '/robot1',
+        'goals': 2,
+        'frames': Proof(3, {'out': 'film.gif'}),
+    },
+    watch_top_view,
+)
+
+
+def watch_ant_training(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    save = controller_train.ControllerTraining.save
+
+    def noting(training):
+        seen.append(('saved', training.replay.added))
+        save(training)
+
+    patch.setattr(controller_train.ControllerTraining, 'save', noting)
+
+
+ANT = Walk(
+    'controller train',
+    {
+        'steps': 12,
+        'random_steps': 4,
+        'decay_steps': 2,
+        'replay_size': 50,
+        'log_every': 4,
+        'sac.batch_size': 4,
+        'sac.lr': 0.01,
+        'sac.actor_hidden': [4],
+        'sac.critic_hidden': [4],
+    },
+    {
+        'resume': Proof(True, again=True),
+        'out': 'elsewhere',
+        'steps': 11,
+        'decay_steps': 8,
+        'update_every': 1,
+        'replay_size': 3,
+        'random_steps': 6,
+        'seed': 1,
+        'checkpoint_every': 3,
+        'log_every': 3,
+        'threads': 2,
+        'sac.lr': 0.1,
+        'sac.critic_lr': 0.1,
+        'sac.batch_size': 3,
+        'sac.discount': 0.5,
+        'sac.tau': 0.5,
+        'sac.target_entropy': 3.0,
+        'sac.temperature': 2.0,
+        'sac.actor_hidden': [3],
+        'sac.critic_hidden': [3],
+        'sac.actor_layer_norm': True,
+        'sac.critic_layer_norm': True,
+        'sac.critics': 'mean',
+        'sac.actor_critics': 'first',
+        'sac.actor_every': 2,
+        'sac.log_std_range': [-1.0, -0.5],
+    },
+    watch_ant_training,
+)
+
+
+def watch_humanoid_training(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    class Training:
+        sweep, total = 0, 1
+
+        def __init__(self, out, seed, stages):
+            seen.append((out, seed, stages))
+            self.checkpoint = out / 'checkpoint.safetensors'
+
+        def restore(self):
+            seen.append('restored')
+
+        def run(self, log, should_stop, log_every, checkpoint_every):
+            seen.append((log_every, checkpoint_every))
+            self.checkpoint.touch()
+            return True
+
+    patch.setattr(humanoid, 'HumanoidTraining', Training)
+
+
+HUMANOID = Walk(
+    'controller train-humanoid',
+    {},
+    {
+        'resume': Proof(True, again=True),
+        'out': 'elsewhere',
+        'length': 0.5,
+        'seed': 1,
+        'checkpoint_every': 3,
+        'log_every': 3,
+        'threads': 2,
+    },
+    watch_humanoid_training,
+)
+
+
+def watch_measuring(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    def walk_along(follower, *given):
+        seen.append(('walk', follower.robot, given))
+        figures = dict.fromkeys(('speed', 'drift_m', 'period_s', 'falls', 'duration_s'), 1.0)
+        return SimpleNamespace(direction=given[0], **figures)
+
+    def walk_to_goal(follower, maze, *given):
+        seen.append(('goal', maze.spec.name, given))
+        return GoalRun(reached=True, fallen=False, duration_s=1.0)
+
+    patch.setattr(controller_measure, 'walk_along', walk_along)
+    patch.setattr(controller_measure, 'walk_to_goal', walk_to_goal)
+    patch.setattr(controller_measure, 'OGBenchMaze', ShortSimulator)
+    patch.setattr(controller_measure, 'film', lambda _, *given: seen.append(given))
+    patch.setattr(plots, 'controller_picture', lambda walks: None)
+    note_pictures(patch, seen)
+
+
+MEASURE = Walk(
+    'controller measure',
+    {'directions': 2, 'repeats': 1, 'walks': 2, 'mazes': ['medium'], 'episodes_per_task': 1},
+    {
+        'controller': str(BUNDLED / 'humanoid'),
+        'directions': 3,
+        'duration_s': 1.0,
+        'repeats': 2,
+        'walks': 3,
+        'mazes': ['large'],
+        'episodes_per_task': 2,
+        'action_noise': 0.4,
+        'seed': 1,
+        'out': 'out/elsewhere',
+        'gif': 'walk.gif',
+    },
+    watch_measuring,
+)
+
+WALKS = (
+    GENERATE,
+    DOWNLOAD,
+    IMPORT,
+    CONVERT,
+    PACK,
+    DIAGNOSTICS,
+    TOP_VIEW,
+    ANT,
+    HUMANOID,
+    MEASURE,
+)
+
+
+@walks_through(WALKS)
+def test_setting(walk: Walk, name: str, tmp_path: Path, places: Path) -> None:
+    walk.check(name, tmp_path, places)

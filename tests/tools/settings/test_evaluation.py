@@ -1,0 +1,189 @@
+"""Every setting of what evaluates, adapts and draws policies, by the adaptations that it makes."""
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from metagcttt_core.evaluation import rollout
+from metagcttt_tools import draw_episodes, evaluate, loss_curves, report, sweep
+from metagcttt_tools.common import plots
+import pytest
+from tests.tools.settings.walk import (
+    FILTER,
+    INNER_LOOP,
+    Proof,
+    Seen,
+    ShortSimulator,
+    under,
+    Walk,
+    walks_through,
+)
+
+CRITIC = {'checkpoints': ['@gciql']}
+LOOP = {**INNER_LOOP, 'optimizer_state': 'pretrained'}
+TTT = {**LOOP, 'lr': 0.1, 'horizon': 2}
+WIDE = {'filter.epsilon': 4.0, 'filter.top_percent': 50.0}
+QUICK = {**WIDE, 'ttt.batch_size': 8, 'dataset': '@walks.npz'}
+
+
+def note_adaptations(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    """The supports, the experts and the actor loss of each adaptation in an episode."""
+    adapt = rollout.adapt
+
+    def noting(agent, dataset, support, *others, **named):
+        adaptation = adapt(agent, dataset, support, *others, **named)
+        seen.append((support.indices, adaptation.agent))
+        return adaptation
+
+    patch.setattr(rollout, 'adapt', noting)
+
+
+def watch_evaluation(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    class InThisProcess(ThreadPoolExecutor):
+        def __init__(self, processes, *, mp_context, initializer, initargs):
+            seen.append(('processes', processes))
+            super().__init__(1, initializer=initializer, initargs=initargs)
+
+    class NotedLog(evaluate.JobLog):
+        def __init__(self, path, settings, *, resume):
+            seen.append(('resume', resume))
+            super().__init__(path, settings, resume=resume)
+
+    patch.setattr(evaluate, 'ProcessPoolExecutor', InThisProcess)
+    patch.setattr(evaluate, 'JobLog', NotedLog)
+    patch.setattr(evaluate, 'make_simulator', ShortSimulator)
+    note_adaptations(patch, seen)
+
+
+EVALUATION = {
+    'resume': True,
+    'dataset': '@half.npz',
+    'out': 'elsewhere.json',
+    'budgets': [1],
+    'episodes': 2,
+    'seeds': [5],
+    'processes': 3,
+}
+EVALUATE = Walk(
+    'evaluate',
+    {**QUICK, 'checkpoints': ['@gcbc'], 'budgets': [2], 'episodes': 1, 'seeds': [0]},
+    {
+        **EVALUATION,
+        'checkpoints': ['@other'],
+        'actor_loss': Proof('awr', CRITIC),
+        **under('ttt', TTT, actor_only=CRITIC),
+        **under('filter', FILTER, min_steps=CRITIC),
+    },
+    watch_evaluation,
+)
+CRITIC_RUN = {'runs': ['@run-critic']}
+SUCCESS_CURVE = Walk(
+    'success-curve',
+    {**QUICK, 'runs': ['@run-a'], 'budgets': [2], 'episodes': 1, 'seeds': [0]},
+    {
+        **EVALUATION,
+        'runs': ['@run-b'],
+        'actor_loss': Proof('awr', CRITIC_RUN),
+        **under('ttt', TTT, actor_only=CRITIC_RUN),
+        **under('filter', FILTER, min_steps=CRITIC_RUN),
+    },
+    watch_evaluation,
+)
+
+
+def watch_drawing(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    patch.setattr(draw_episodes, 'make_simulator', ShortSimulator)
+    # Its figures are times.
+    patch.setattr(draw_episodes, 'write_report', lambda path, *_: seen.append(path))
+    patch.setattr(plots, 'demo_picture', lambda *arguments, **named: None)
+    patch.setattr(plots, 'save', lambda figure, path: seen.append(path))
+    note_adaptations(patch, seen)
+
+
+DRAW = Walk(
+    'draw-episodes',
+    {**QUICK, 'checkpoint': '@gcbc', 'budgets': [2], 'filter.variant': 'paper'},
+    {
+        'checkpoint': '@other',
+        'dataset': '@half.npz',
+        'budgets': [1],
+        'seed': 1,
+        'out': 'elsewhere',
+        **under('ttt', TTT, actor_only={'checkpoint': '@gciql'}),
+        **under('filter', FILTER, min_steps={'checkpoint': '@gciql'}),
+    },
+    watch_drawing,
+)
+
+
+def watch_losses(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    patch.setattr(loss_curves, 'make_simulator', ShortSimulator)
+    patch.setattr(plots, 'save', lambda figure, path: seen.append(path))
+
+
+LOSSES = Walk(
+    'loss-curves',
+    {**QUICK, 'checkpoint': '@gcbc', 'lrs': [0.01], 'ttt.steps': 3},
+    {
+        'checkpoint': '@other',
+        'run': '@logged',
+        'dataset': '@half.npz',
+        'task': 2,
+        'lrs': [0.1],
+        'actor_loss': Proof('awr', {'checkpoint': '@gciql'}),
+        'seed': 1,
+        'out': 'elsewhere.json',
+        'ttt.steps': 2,
+        **under('ttt', LOOP, actor_only={'checkpoint': '@gciql'}),
+        **under('filter', FILTER, min_steps={'checkpoint': '@gciql'}),
+    },
+    watch_losses,
+)
+
+
+def watch_study(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    patch.setattr(
+        sweep,
+        '_run_all',
+        lambda tool, runs, processes, stop: seen.append((tool, list(runs), processes)),
+    )
+
+
+ARMS = {'slow': {'meta': {'inner_lr': 1e-6}}}
+STUDY = Walk(
+    'sweep',
+    {'seeds': [0], 'arms': ARMS},
+    {
+        'base': 'antmaze-medium-navigate-study',
+        'seeds': [1],
+        'arms': {'slow': {'meta': {'inner_lr': 1e-7}, 'seeds': [3]}},
+        'adaptations': {'actor-only': {'actor_only': True}},
+        'curve': [0.5],
+        'curve_budgets': Proof([7], {'curve': [0.5]}),
+        'processes': 1,
+        'out': 'elsewhere',
+    },
+    watch_study,
+)
+
+
+def watch_report(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    def read(study, threshold):
+        seen.append((study, threshold))
+        return {'adaptations': {}, 'curve': {}}
+
+    patch.setattr(report, 'read_study', read)
+    patch.setattr(report, 'format_report', lambda contents: '')
+    patch.setattr(plots, 'success_curves', lambda panels: None)
+    patch.setattr(plots, 'save', lambda figure, path: seen.append(path))
+
+
+REPORT = Walk(
+    'report', {}, {'study': 'out/other', 'out': 'elsewhere', 'threshold': 0.5}, watch_report
+)
+
+WALKS = (EVALUATE, SUCCESS_CURVE, DRAW, LOSSES, STUDY, REPORT)
+
+
+@walks_through(WALKS)
+def test_setting(walk: Walk, name: str, tmp_path: Path, places: Path) -> None:
+    walk.check(name, tmp_path, places)

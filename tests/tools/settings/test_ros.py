@@ -1,0 +1,171 @@
+"""Every setting of what drives robots through the ROS graph, by what the nodes are told."""
+
+from contextlib import nullcontext
+from pathlib import Path
+from unittest import mock
+
+from metagcttt import commander
+import metagcttt_core
+from metagcttt_tools import demo
+from metagcttt_tools.benchmarks import restarts, ros, state_source
+from metagcttt_tools.graph import drive
+from metagcttt_tools.graph import process as nodes
+import numpy as np
+import pytest
+import rclpy
+from tests.tools.settings.walk import FILTER, INNER_LOOP, Proof, Seen, Walk, walks_through
+
+pytestmark = pytest.mark.ros
+
+
+def watch_graph(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    def note(arms, drives, **others):
+        seen.append((arms, drives, others))
+        report = mock.Mock(filter_ms=1.0, adapt_ms=1.0)
+        outcome = mock.Mock(success=True, report=report)
+        return {arm: [outcome] * len(drives) for arm in arms}
+
+    patch.setattr(drive, 'drive_arms', note)
+    patch.setattr(demo, 'report', lambda *_: None)
+
+
+NO_PARAMETER = 'policy_node has no such parameter'
+WITHOUT_PARAMETER = {
+    **{f'ttt.{name}': INNER_LOOP[name] for name in ('optimizer', 'fix_actor_goal', 'ratio')},
+    **{f'filter.{name}': FILTER[name] for name in ('top_k', 'position_dims', 'scale', 'slack')},
+    'ttt.max_test': 1,
+    'filter.min_steps': 60,
+    'filter.seed': 5,
+}
+EVALUATE_ROS = Walk(
+    'evaluate-ros',
+    {
+        'dataset': '@walks.npz',
+        'checkpoints': ['@gcbc'],
+        'budgets': [2],
+        'episodes': 1,
+        'seeds': [0],
+    },
+    {
+        'checkpoints': ['@other'],
+        'dataset': '@half.npz',
+        'budgets': [1],
+        'episodes': 2,
+        'seeds': [5],
+        'timeout_s': 7.0,
+        'out': 'elsewhere/evaluation.json',
+        'ttt.lr': 0.1,
+        'ttt.batch_size': 9,
+        'ttt.early_stopping': True,
+        'ttt.test_fraction': 0.6,
+        'ttt.actor_only': True,
+        'ttt.horizon': 2,
+        'ttt.optimizer_state': 'pretrained',
+        'filter.variant': 'gcttt',
+        'filter.epsilon': 9.0,
+        'filter.top_percent': 50.0,
+        **{
+            name: Proof(getattr(proof, 'value', proof), refused=NO_PARAMETER)
+            for name, proof in WITHOUT_PARAMETER.items()
+        },
+    },
+    watch_graph,
+)
+DEMO = Walk('demo', {}, {'out': 'elsewhere', 'steps': 3, 'seed': 1, 'timeout_s': 7.0}, watch_graph)
+
+
+def watch_latency(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    """The policy node and the program in the simulator's place are noted, and time flies."""
+
+    class Source:
+        seen = mock.Mock(adapted={})
+
+        def __init__(self, observations, rate_hz, check):
+            seen.append(('rate', rate_hz))
+            self.period_s = 1 / rate_hz
+
+        def wait_until_ready(self, timeout_s):
+            seen.append(('wait', timeout_s))
+
+        def configure_policy(self, **parameters):
+            seen.append(parameters)
+
+        def send_goal(self, goal, seed):
+            seen.append((goal, seed))
+            return 1, 0.0
+
+        def play(self, duration_s, every=lambda elapsed_s: None, until=None):
+            seen.append(('play', duration_s))
+            for elapsed_s in np.linspace(0, duration_s, 5):
+                every(elapsed_s)
+            answers = mock.Mock(sent={}, adapted={}, reports=[])
+            answers.latencies_ms.return_value = np.ones(1)
+            return answers
+
+        def destroy_node(self):
+            pass
+
+    def process(*given):
+        seen.append((given[0], without_folder(given[1]), given[2]))
+        return mock.MagicMock()
+
+    def without_folder(parameters):
+        return {name: value for name, value in parameters.items() if name != 'checkpoint'}
+
+    patch.setattr(state_source, 'StateSource', Source)
+    patch.setattr(nodes, 'NodeProcess', process)
+    patch.setattr(metagcttt_core, 'save_checkpoint', lambda agent, path: seen.append(agent))
+    patch.setattr(ros, 'write_report', lambda path, *_: seen.append(path))
+    without_graph(patch)
+
+
+def without_graph(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(drive, 'own_domain', nullcontext)
+    for call in ('init', 'try_shutdown'):
+        patch.setattr(rclpy, call, lambda: None)
+
+
+BENCHMARK_ROS = Walk(
+    'benchmark ros',
+    {'hidden': [4], 'steps': [1], 'repeats': 1},
+    {
+        'out': 'elsewhere',
+        'duration_s': 7.0,
+        'idle_s': 7.0,
+        'goal_every_s': 100.0,
+        'rate_hz': 7.0,
+        'agent': 'gciql',
+        'hidden': [3],
+        'steps': [2],
+        'repeats': 2,
+        'timeout_s': 7.0,
+        'stepping': 'lockstep',
+        'seed': 1,
+    },
+    watch_latency,
+)
+
+
+def watch_restarts(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    node = mock.Mock()
+    node.stop.return_value = 0
+    patch.setattr(restarts.RestartsBenchmark, '_start', lambda *_, **__: node)
+    patch.setattr(restarts, 'drive', lambda commander, *given, **_: seen.append(given))
+    patch.setattr(restarts, 'write_report', lambda path, *_: seen.append(path))
+    patch.setattr(commander, 'RobotCommander', mock.Mock)
+    without_graph(patch)
+
+
+BENCHMARK_RESTARTS = Walk(
+    'benchmark restarts',
+    {'repeats': 1},
+    {'out': 'elsewhere', 'repeats': 2, 'timeout_s': 7.0},
+    watch_restarts,
+)
+
+WALKS = (EVALUATE_ROS, DEMO, BENCHMARK_ROS, BENCHMARK_RESTARTS)
+
+
+@walks_through(WALKS)
+def test_setting(walk: Walk, name: str, tmp_path: Path, places: Path) -> None:
+    walk.check(name, tmp_path, places)
