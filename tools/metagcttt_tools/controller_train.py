@@ -104,7 +104,9 @@ class ControllerTraining:
             if done > settings.random_steps and done % settings.update_every == 0:
                 batch = replay.sample(settings.sac.batch_size, rng)
                 self.learner.scale_lr(self._lr_share(step))
-                meters.losses = self.learner.update(batch, rng)
+                number = done // settings.update_every
+                actor = number % settings.sac.actor_every == 0
+                meters.losses |= self.learner.update(batch, rng, actor=actor)
             if done % settings.log_every == 0:
                 log(done, meters.read())
             stopping = should_stop()
