@@ -6,6 +6,7 @@ from pathlib import Path
 from metagcttt_core import make_agent, save_checkpoint
 from metagcttt_tools import evaluate, evaluate_ros
 import pytest
+import torch
 
 from tests.tools.tables import squeezed
 
@@ -17,6 +18,14 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp('policy')
     agent = make_agent('gcbc', obs_dim=2, act_dim=2, hidden=(32, 32))
     agent.metadata['environment'] = 'pointmaze-medium-v0'
+    agent.optimizer_state = {
+        number: {
+            'step': torch.tensor(100.0),
+            'exp_avg': torch.zeros_like(weight),
+            'exp_avg_sq': torch.full_like(weight, 1e-6),
+        }
+        for number, weight in enumerate(agent.trained_parameters())
+    }
     save_checkpoint(agent, path)
     return path
 
@@ -30,7 +39,12 @@ def test_success_is_that_without_ros(
         'dataset': dataset_file,
         'budgets': (0, 60),
         # Enough for an untrained policy to reach some goals.
-        'ttt': {'lr': 0.01, 'batch_size': 64, 'horizon': 400},
+        'ttt': {
+            'lr': 0.01,
+            'batch_size': 64,
+            'horizon': 400,
+            'optimizer_state': 'pretrained',
+        },
         'filter': {'variant': 'gcttt'},
         'episodes': 1,
         'seeds': (0,),

@@ -7,6 +7,7 @@ from metagcttt_core import TrajectoryDataset
 from metagcttt_tools import controller_measure, controller_train_humanoid, generate
 from metagcttt_tools.controller import film
 import numpy as np
+from PIL import Image
 import pytest
 from sim_bridge.controllers import HumanoidFollower, load_follower
 
@@ -101,7 +102,7 @@ def test_film_shows_the_walk(
 
     monkeypatch.setattr(film, 'draw_walk', draw)
     film.film(load_follower(trained / 'controller'), tmp_path / 'walk.gif', 0, duration_s=0.5)
-    with film.Image.open(tmp_path / 'walk.gif') as picture:
+    with Image.open(tmp_path / 'walk.gif') as picture:
         assert (picture.n_frames, picture.size) == (3, (6, 4))
         picture.seek(2)
         colours = np.array(picture.convert('RGB'))

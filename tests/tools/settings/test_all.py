@@ -14,7 +14,7 @@ WALKS: dict[str, Walk] = {
 }
 
 
-@pytest.mark.parametrize('program', all_programs())
+@pytest.mark.parametrize('program', list(all_programs()))
 def test_every_setting_has_a_proof(program: str) -> None:
     proofs = WALKS[program].proofs if program in WALKS else {}
     assert sorted(leaves_of(settings_of(program))) == sorted(proofs)

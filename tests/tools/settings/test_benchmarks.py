@@ -63,6 +63,7 @@ BENCHMARK_META = Walk(
         'tasks': [3],
         'seed': 1,
         **{name: proof for name, proof in META.proofs.items() if name.startswith('meta.')},
+        'meta.outer_steps': Proof(3, {'meta.algorithm': 'reptile'}),
         'meta.actor_only': Proof(True, refused=NO_CRITIC),
         'meta.filter.min_steps': Proof(60, refused=NO_CRITIC),
     },

@@ -53,12 +53,17 @@ class MetaBenchmark(Benchmark):
     seed: int = Field(0, ge=0, description='of tasks and batches')
 
     @model_validator(mode='after')
-    def _nothing_of_a_critic(self) -> Self:
+    def _measurable(self) -> Self:
         default = FilterConfig().min_steps
         if self.meta.actor_only or self.meta.filter.min_steps != default:
             raise ValueError(
                 'meta.actor_only and meta.filter.min_steps have no effect on GCBC, which has no '
                 'critic'
+            )
+        if self.meta.outer_steps < 2:
+            raise ValueError(
+                f'meta.outer_steps is {self.meta.outer_steps}, but the first outer step is not '
+                'measured, since it builds the index of the filter: set at least 2'
             )
         return self
 

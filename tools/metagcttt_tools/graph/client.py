@@ -4,12 +4,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 import time
+from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 from metagcttt.commander import NoAnswerError, RobotCommander
 from metagcttt_interfaces.msg import AdaptationReport, EpisodeEvent, MazeState
 from metagcttt_interfaces.srv import SetTask
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.time import Time
 
 # Also what a node said before it had discovered this program.
 _EVERY = QoSProfile(
@@ -48,13 +50,14 @@ class _Watched:
 class MazeClient(RobotCommander):
     """Drives the graph by its public names: `set_task`, `goal_pose`, `episode`, `adaptation`."""
 
-    def __init__(self, check_processes: Callable[[], None]) -> None:
+    def __init__(self, check_processes: Callable[[], None], **kwargs: Any) -> None:
         """Join the graph.
 
         Args:
             check_processes: Called while waiting; raises when a node process has died.
+            kwargs: For `RobotCommander`.
         """
-        super().__init__(name='maze_client', while_waiting=check_processes)
+        super().__init__(name='maze_client', while_waiting=check_processes, **kwargs)
         self._seen = _Watched()
         self._goal_pose = self.create_publisher(PoseStamped, 'goal_pose', 10)
         self.create_subscription(
@@ -132,7 +135,7 @@ class MazeClient(RobotCommander):
         """Wait for what the goal node makes of the goal that the simulator announced."""
 
         def answers() -> list[EpisodeEvent]:
-            return [event for event in self._answers(0) if event.episode_id == episode_id]
+            return [event for event in self._answers() if event.episode_id == episode_id]
 
         self.wait(lambda: bool(answers()), "the task's goal", timeout_s)
         event = answers()[0]
@@ -149,10 +152,11 @@ class MazeClient(RobotCommander):
             pose.header.stamp = self.get_clock().now().to_msg()
             pose.pose.position = task.goal_position
             pose.pose.orientation.w = 1.0
-            known = len(self._seen.events)
             self._goal_pose.publish(pose)
-            self.wait(partial(self._is_answered, known), 'goal_pose', timeout_s)
-            event = self._answers(known)[0]
+            since = Time.from_msg(pose.header.stamp)
+            answers = partial(self._answers, since)
+            self.wait(answers, 'goal_pose', timeout_s)
+            event = answers()[0]
             if event.episode_id == task.episode_id:
                 if event.kind == EpisodeEvent.GOAL_REJECTED:
                     raise NoAnswerError(f'the goal was rejected: {event.reason}')
@@ -164,12 +168,18 @@ class MazeClient(RobotCommander):
     def _states(self, episode_id: int) -> list[MazeState]:
         return [state for state in self._seen.states if state.episode_id == episode_id]
 
-    def _answers(self, known: int) -> list[EpisodeEvent]:
-        kinds = (EpisodeEvent.GOAL_ACCEPTED, EpisodeEvent.GOAL_REJECTED)
-        return [event for event in self._seen.events[known:] if event.kind in kinds]
+    def _answers(self, since: Time | None = None) -> list[EpisodeEvent]:
+        """What the goal node made of goals, except of those that it had before a time.
 
-    def _is_answered(self, known: int) -> bool:
-        return bool(self._answers(known))
+        The goal node repeats its last events to whoever joins, some of them after the join.
+        """
+        kinds = (EpisodeEvent.GOAL_ACCEPTED, EpisodeEvent.GOAL_REJECTED)
+        return [
+            event
+            for event in self._seen.events
+            if event.kind in kinds
+            and (since is None or Time.from_msg(event.header.stamp) >= since)
+        ]
 
     def _events_of(self, query_id: int, kinds: tuple[int, ...]) -> list[EpisodeEvent]:
         return [e for e in self._seen.events if e.query_id == query_id and e.kind in kinds]
