@@ -110,5 +110,5 @@ class Registry(MutableMapping[str, T]):
         return iter(dict.fromkeys([*self._built_in, *self.plugins, *self._loaded]))
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Number of names."""
         return len(list(iter(self)))

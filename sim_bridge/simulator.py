@@ -60,7 +60,7 @@ class Task:
 
 @dataclass(frozen=True)
 class MazeDescription:
-    """Everything about a maze that needs no physics."""
+    """Description of a maze without its physics."""
 
     spec: SimulatorSpec
     maze: MazeMap

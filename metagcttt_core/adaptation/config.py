@@ -9,7 +9,7 @@ from metagcttt_core.training.config import OptimizerName
 
 
 class InnerLoopConfig(Settings):
-    """What test-time training and the inner loop of post-training have in common."""
+    """Settings shared by test-time training and the inner loop of post-training."""
 
     batch_size: int = Field(1024, ge=1, description='transitions per inner step')
     optimizer: OptimizerName = Field('adam', description='inner optimiser')

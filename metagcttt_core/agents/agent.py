@@ -1,4 +1,4 @@
-"""What every goal-conditioned agent offers."""
+"""Interface of every goal-conditioned agent."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
@@ -155,7 +155,7 @@ class Agent(nn.Module, ABC):
 
     @property
     def device(self) -> torch.device:
-        """Where the weights are."""
+        """Device of the weights."""
         return next(self.parameters()).device
 
     def tensors(self, batch: Mapping[str, np.ndarray]) -> TensorBatch:

@@ -48,7 +48,7 @@ class MetaConfig(InnerLoopConfig):
 
     @model_validator(mode='after')
     def _meta_lr_fits_the_algorithm(self) -> Self:
-        """What is a good merging coefficient ruins a policy as the rate of the outer Adam."""
+        """Refuse a merging coefficient as the outer Adam's rate: it would ruin the policy."""
         if self.meta_lr is None:
             return self
         if self.algorithm == 'continual':

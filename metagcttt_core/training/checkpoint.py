@@ -30,7 +30,7 @@ class CheckpointError(ValueError):
 
 @dataclass(frozen=True)
 class TrainingState:
-    """What a run needs besides the weights to go on as if never interrupted.
+    """State, besides the weights, from which a run goes on as if never interrupted.
 
     Attributes:
         stage: `pretrain` or `post_train`.

@@ -144,7 +144,7 @@ class HumanoidGround:
         self.inputs = self._look()
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Everything that a resumed run needs, by name."""
+        """State of the training for a resumed run, by name."""
         import mujoco
 
         size = mujoco.mj_stateSize(self._envs[0].model, mujoco.mjtState.mjSTATE_INTEGRATION)

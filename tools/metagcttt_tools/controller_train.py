@@ -59,7 +59,7 @@ class TrainControllerSettings(Resumable):
 
     @property
     def checkpoint(self) -> Path:
-        """Everything that a resumed run needs."""
+        """State of the training for a resumed run."""
         return self.out / 'checkpoint.safetensors'
 
 

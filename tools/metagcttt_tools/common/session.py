@@ -181,7 +181,7 @@ def _steps_to_continue_from(settings: RunSettings, steps: int) -> int:
 
 
 def left_behind(settings: RunSettings) -> str:
-    """What a failed run can be resumed from, as a phrase."""
+    """Phrase for a failed run: the step of its checkpoint, if it has left one."""
     from metagcttt_core.training.checkpoint import steps_done
 
     step = steps_done(settings.checkpoint_folder)

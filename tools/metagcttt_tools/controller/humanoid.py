@@ -57,7 +57,7 @@ class HumanoidTraining:
 
     @property
     def checkpoint(self) -> Path:
-        """Everything that a resumed run needs."""
+        """State of the training for a resumed run."""
         return self.out / 'checkpoint.safetensors'
 
     @property

@@ -139,7 +139,7 @@ class SAC:
             group['lr'] = share * full
 
     def tensors(self) -> dict[str, Tensor]:
-        """Everything that a resumed run needs, by name."""
+        """State of the training for a resumed run, by name."""
         networks = {'actor': self.actor, 'critic': self.critic, 'target': self.target}
         named = {
             f'{network}.{name}': tensor

@@ -169,7 +169,7 @@ class MazeClient(RobotCommander):
         return [state for state in self._seen.states if state.episode_id == episode_id]
 
     def _answers(self, since: Time | None = None) -> list[EpisodeEvent]:
-        """What the goal node made of goals, except of those that it had before a time.
+        """Acceptances and rejections of goals that the goal node sent since a time.
 
         The goal node repeats its last events to whoever joins, some of them after the join.
         """
