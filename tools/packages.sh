@@ -12,18 +12,28 @@ answers() { # PYTHON URL
     "$2" >/dev/null 2>&1
 }
 
-# Install PyTorch's CPU build where there is no NVIDIA GPU. What this leaves out, or cannot get,
-# comes with the other packages.
+# Install PyTorch's CPU build where there is no NVIDIA GPU; gigabytes of CUDA come there only on
+# request. What this leaves out comes with the other packages.
 install_torch() { # PYTHON [PIP OPTION...]
-  local index=$cpu_builds
+  local index=$cpu_builds pip=("$1" -m pip "${@:2}") plan
   if has_gpu; then
     say 'there is an NVIDIA GPU: PyTorch comes with CUDA'
   elif ! answers "$1" "$index/torch/"; then
-    say "no answer from $index: PyTorch comes from pip's own index, perhaps with CUDA"
-  elif ! "$1" -m pip "${@:2}" install --no-deps --index-url "$index" \
-    -c "$root/constraints.txt" torch; then
+    say "no answer from $index: PyTorch comes from pip's own index"
+  elif "${pip[@]}" install --no-deps --index-url "$index" -c "$root/constraints.txt" torch; then
+    return 0
+  else
     say "no PyTorch for this Python in $index: it comes from pip's own index"
   fi
+  has_gpu || [ "${METAGCTTT_CUDA:-0}" = 1 ] && return 0
+  plan=$("${pip[@]}" install --dry-run -c "$root/constraints.txt" torch)
+  case $plan in
+    *nvidia-* | *cuda-*)
+      echo "setup: pip's own index has PyTorch only with gigabytes of CUDA, and there is no NVIDIA" \
+        "GPU here: make $index reachable, or accept them with METAGCTTT_CUDA=1" >&2
+      return 1
+      ;;
+  esac
 }
 
 # From Python 3.13 on, the extra `mazes` leaves ogbench out; see pyproject.toml.

@@ -41,7 +41,8 @@ class Machine:
             (self.path / tool).symlink_to(shutil.which(tool))
 
     def tool(self, name: str, script: str) -> None:
-        """Put a program on the PATH."""
+        """Put a program on the PATH, never through a link into the machine's own."""
+        (self.path / name).unlink(missing_ok=True)
         (self.path / name).write_text(f'#!/bin/bash\n{script}\n')
         (self.path / name).chmod(0o755)
 
@@ -130,6 +131,7 @@ def test_second_setup_waits_for_the_first(machine: Machine, hold_lock) -> None:
 PYTHON = r"""
 case "$*" in
   *'-m venv'*) mkdir -p "$3/bin" && cat "$0" >"$3/bin/python" && chmod +x "$3/bin/python" ;;
+  *--dry-run*) echo "Would install torch-2.13.0 ${PLAN:-sympy-1.14.0}" ;;
   *-m\ pip*) echo "$*" >>"$HOME/pip" ;;
   *urlopen*) exit "${NO_ANSWER:-0}" ;;
   *'version_info < (3, 13)'*) exit "${BEFORE_3_13:-0}" ;;
@@ -184,6 +186,18 @@ def test_set_up_goes_on_without_the_index_of_cpu_builds(set_up) -> None:
     printed, asked = set_up(NO_ANSWER='1')
     assert 'no answer from https://download.pytorch.org/whl/cpu' in printed
     assert '--index-url' not in asked
+
+
+@needs_no_gpu
+@pytest.mark.parametrize('cuda', ['nvidia-cublas-13.1.0.3', 'cuda-bindings-13.0.3'])
+def test_cuda_comes_without_a_gpu_only_on_request(
+    cuda: str, machine: Machine, set_up, tmp_path: Path
+) -> None:
+    with pytest.raises(AssertionError, match='only with gigabytes of CUDA.*METAGCTTT_CUDA=1'):
+        set_up(NO_ANSWER='1', PLAN=cuda)
+    assert '-e ' not in (tmp_path / 'pip').read_text()
+    _, asked = set_up(NO_ANSWER='1', PLAN=cuda, METAGCTTT_CUDA='1')
+    assert '-e ' in asked
 
 
 def test_gpu_gets_the_build_with_cuda(machine: Machine, set_up) -> None:
