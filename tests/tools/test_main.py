@@ -10,7 +10,8 @@ import sys
 import tomllib
 
 from metagcttt_tools.common import run_log
-from metagcttt_tools.main import EXTRAS, main
+from metagcttt_tools.common.extras import EXTRAS
+from metagcttt_tools.main import main
 import pytest
 
 PROJECT = tomllib.loads((Path(__file__).parents[2] / 'pyproject.toml').read_text())['project']

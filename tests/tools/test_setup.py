@@ -193,7 +193,7 @@ def test_set_up_goes_on_without_the_index_of_cpu_builds(set_up) -> None:
 def test_cuda_comes_without_a_gpu_only_on_request(
     cuda: str, machine: Machine, set_up, tmp_path: Path
 ) -> None:
-    with pytest.raises(AssertionError, match='only with gigabytes of CUDA.*METAGCTTT_CUDA=1'):
+    with pytest.raises(AssertionError, match=r'only with gigabytes of CUDA.*METAGCTTT_CUDA=1'):
         set_up(NO_ANSWER='1', PLAN=cuda)
     assert '-e ' not in (tmp_path / 'pip').read_text()
     _, asked = set_up(NO_ANSWER='1', PLAN=cuda, METAGCTTT_CUDA='1')

@@ -12,6 +12,7 @@ from pydantic import create_model
 import tyro
 
 from metagcttt_tools.common.cli import fail, flags_of
+from metagcttt_tools.common.extras import EXTRAS, install_command
 
 _DESCRIPTION = """Goal-conditioned policies that adapt at test time, from data to robot.
 
@@ -45,6 +46,7 @@ PROGRAMS: dict[str, Program | Group] = {
     'sweep': Program('sweep', 'Run a whole study: training, post-training, evaluation.'),
     'report': Program('report', 'Tables and figures of a study.'),
     'demo': Program('demo', 'Drive the point maze over ROS 2: three policies, five goals.'),
+    'doctor': Program('doctor', 'What works on this machine, and how to mend the rest.'),
     'presets': Program('show_presets', "List the presets; the paper's settings as tables."),
     'diagnostics': Program('diagnostics', 'Draw how a post-training run went.'),
     'loss-curves': Program('loss_curves', 'Draw the losses of test-time training by part.'),
@@ -75,19 +77,6 @@ PROGRAMS: dict[str, Program | Group] = {
     'pack-assets': Program('pack_assets', 'Pack policies and data into the assets of the demo.'),
 }
 
-# What is not part of the smallest installation, and what brings it.
-EXTRAS = {
-    'PIL': 'mazes',
-    'gymnasium': 'mazes',
-    'gymnasium_robotics': 'mazes',
-    'h5py': 'minari',
-    'matplotlib': 'plots',
-    'mcap': 'recordings',
-    'mcap_ros2': 'recordings',
-    'mujoco': 'mazes',
-    'ogbench': 'mazes',
-    'tensorboard': 'plots',
-}
 _ROS = frozenset({'domain_coordinator', 'metagcttt', 'metagcttt_interfaces', 'rclpy'})
 
 
@@ -122,10 +111,7 @@ def _run(program: Program, arguments: list[str]) -> None:
     except ModuleNotFoundError as error:
         missing = (error.name or '').partition('.')[0]
         if missing in EXTRAS:
-            install = f'pip install "metagcttt-core[{EXTRAS[missing]}]"'
-            if missing == 'ogbench' and sys.version_info >= (3, 13):
-                install = 'pip install --no-deps ogbench'  # see pyproject.toml
-            fail(f'this takes {missing}, which is not installed: {install}')
+            fail(f'this takes {missing}, which is not installed: {install_command(missing)}')
         if missing in _ROS:
             fail(f'this takes ROS 2 and the workspace ({missing} is missing): make setup')
         raise
