@@ -1,7 +1,7 @@
 # Every target does the set-up that it needs; `make help` lists them.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test assets lint wheel clean
+.PHONY: help setup demo test assets docs lint wheel release clean
 
 PYTHON := .venv/bin/python
 METAGCTTT := .venv/bin/metagcttt
@@ -42,6 +42,15 @@ lint: setup ## check style, formatting and types
 wheel: setup ## build the wheel and try it in a fresh environment
 	@tools/check_wheel.sh
 
+docs: setup ## build the documentation site; warnings are errors
+	@.venv/bin/sphinx-build -q -W --keep-going -b html -c docs . docs/_build
+	@echo docs/_build/docs/index.html
+
+release: wheel ## build what is uploaded, sdist and wheel, and check their descriptions
+	@.venv/bin/pip install -q -c constraints.txt -e '.[release]'
+	@rm -rf dist && $(PYTHON) -m build --no-isolation --outdir dist
+	@$(PYTHON) -m twine check --strict dist/*
+
 clean: ## remove .venv, the built workspace and caches; data/ and out/ stay
-	@rm -rf .venv .setup.lock ros2_ws/build ros2_ws/install ros2_ws/log build dist \
+	@rm -rf .venv .setup.lock ros2_ws/build ros2_ws/install ros2_ws/log build dist docs/_build \
 		*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -18,7 +18,7 @@ from tests.core.builders import DATA
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = ('README.md', 'CONTRIBUTING.md', 'docs/guide.md')
+DOCUMENTS = ('README.md', 'CONTRIBUTING.md', 'docs/guide.md', 'docs/faq.md', 'docs/index.md')
 # What the documents take for granted: before their blocks, and before what prose names.
 BEFORE_BLOCKS = {
     'README.md': ['metagcttt generate --kind stitch'],
@@ -33,7 +33,7 @@ BEFORE_PROSE = {
     ],
 }
 NOT_RUN = {
-    r'make (demo|test|setup|assets).*': 'tests of their own, or this very run',
+    r'make (demo|test|setup|assets|docs|release).*': 'tests of their own, or this very run',
     r'source .*': 'sets up a shell',
     r'\.venv/bin/python -m ruff format \.': 'changes the tree',
     r'tensorboard .*': 'a server',

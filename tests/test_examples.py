@@ -3,11 +3,13 @@
 import json
 import os
 from pathlib import Path
+import re
 import shutil
 import subprocess
 import sys
 
 import numpy as np
+from PIL import Image
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -73,3 +75,39 @@ def test_misspelt_agent_is_refused_with_the_known_ones(tmp_path, guests) -> None
     run = metagcttt(['pretrain', '--agent', 'hubert'], tmp_path, guests)
     assert run.returncode == 2
     assert 'huber' in run.stderr
+
+
+SCRIPTS = {
+    'adapt.py': (),
+    'own_data.py': (),
+    'animate_adaptation.py': ('out/adaptation.gif',),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('name', SCRIPTS)
+def test_example_does_what_it_shows(name: str, tmp_path: Path) -> None:
+    (tmp_path / 'assets').symlink_to(ROOT / 'assets')
+    run = subprocess.run(
+        [sys.executable, str(ROOT / 'examples' / name), *SCRIPTS[name]],
+        cwd=tmp_path,
+        env={**os.environ, 'PYTHONPATH': os.pathsep.join(map(str, (ROOT, ROOT / 'tools')))},
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 0, run.stderr
+    numbers = [float(number) for number in re.findall(r'\d+\.\d+', run.stdout)]
+    if name == 'adapt.py':
+        assert numbers[1] < numbers[0]
+    if name == 'own_data.py':
+        base, _, adapted = numbers
+        assert adapted < 1 < base
+    if name == 'animate_adaptation.py':
+        with Image.open(tmp_path / 'out' / 'adaptation.gif') as film:
+            assert film.n_frames > 10
+
+
+def test_examples_are_of_a_page() -> None:
+    for script in (ROOT / 'examples').glob('*.py'):
+        assert len(script.read_text().splitlines()) <= 60, script
+        assert script.name in SCRIPTS or script.name == 'ros_client.py'  # tests/ros runs that

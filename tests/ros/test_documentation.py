@@ -87,6 +87,12 @@ def test_documented_nodes_record_what_documented_programs_read(
             [sys.executable, '-c', drive], env=environment, capture_output=True, text=True
         )
         assert driven.stdout == '60\n', driven.stderr
+        client = [sys.executable, str(ROOT / 'examples' / 'ros_client.py')]
+        for goal, outcome in (('20', 'reached after '), ('-9', 'not reached: ')):
+            driven = subprocess.run(
+                [*client, goal, goal], env=environment, capture_output=True, text=True
+            )
+            assert driven.stdout.startswith(outcome), driven.stdout + driven.stderr
     finally:
         for process in started:
             process.send_signal(signal.SIGINT)
