@@ -39,8 +39,8 @@ _DESCRIPTION = """Run a study: pre-train a policy per seed, post-train each arm,
 
 Example: metagcttt sweep --preset pointmaze-medium-navigate-study
 Each run is a folder of OUT with its own settings, logs and checkpoints. Ctrl-C is safe: the same
-command continues; --dry-run lists what is left and the hours it takes. `metagcttt report OUT` draws the
-figures and writes the tables."""
+command continues; --dry-run lists what is left and the hours it takes.
+`metagcttt report OUT` draws the figures and writes the tables."""
 
 
 class Arm(Settings):

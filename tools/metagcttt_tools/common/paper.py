@@ -1,7 +1,7 @@
 """The paper's settings as presets: `paper-MAZE-DATA-LOSS-ALGORITHM`, one for each row of Table 3.
 
 `paper-MAZE-DATA-LOSS` is the study of its three rows on the same base policies. Trajectories are
-filtered as in the published implementation of GC-TTT, and studies adapt from both optimiser states.
+filtered as in the published implementation of GC-TTT; studies adapt from both optimiser states.
 
 `DATA` is `navigate` (the paper's expert data) or `stitch`; `LOSS` is that of adaptation, `bc` or
 `ddpgbc`. The values are in `paper.yaml`.
