@@ -1,7 +1,7 @@
 """Settings of meta-post-training."""
 
 import math
-from typing import NamedTuple, Self, TYPE_CHECKING
+from typing import Literal, NamedTuple, Self, TYPE_CHECKING
 
 from pydantic import Field, model_validator
 
@@ -42,6 +42,11 @@ class MetaConfig(InnerLoopConfig):
         gt=0,
         description='beta: outer learning rate (fomaml, maml; 3e-4 by default) or merging '
         'coefficient (reptile; 0.1)',
+    )
+    rejected: Literal['test-gradient', 'reject'] = Field(
+        'test-gradient',
+        description='what a task with k* = 0 gives fomaml and maml: its test gradient at theta '
+        '(test-gradient), or nothing (reject)',
     )
     meta_batch_size: int = Field(1, ge=1, description='tasks per outer step B')
     filter: FilterConfig = FilterConfig()

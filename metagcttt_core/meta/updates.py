@@ -87,16 +87,30 @@ def _step_down_the_mean(
     config: MetaConfig,
     optimizer: torch.optim.Optimizer | None,
 ) -> None:
-    """Step the base with the mean of the experts' gradients; its target networks follow."""
+    """Step the base with the mean of the experts' gradients; its target networks follow.
+
+    With `rejected='reject'` experts of k* = 0 are left out of the mean, and where no task of the
+    meta-batch has another one there is no step.
+    """
     if optimizer is None:
         raise ValueError(f'{config.algorithm} needs an outer optimizer')
     parameters = list(base.trained_parameters(actor_only=config.actor_only))
-    means = mean_over_tasks(gradient(expert) for expert in experts)
+    # The weights of the tasks are summed with their gradients, over all processes.
+    *means, weight = mean_over_tasks(
+        _weighted(gradient(expert), float(config.rejected != 'reject' or expert.result.accepted))
+        for expert in experts
+    )
+    if weight == 0:
+        return
     for parameter, mean in zip(parameters, means, strict=True):
-        parameter.grad = mean
+        parameter.grad = mean / weight
     if not config.actor_only:
         base.update_targets()
     optimizer.step()
+
+
+def _weighted(gradient: Sequence[torch.Tensor], weight: float) -> list[torch.Tensor]:
+    return [*(weight * part for part in gradient), gradient[0].new_tensor(weight)]
 
 
 def _mean_weights(experts: Sequence[Expert]) -> list[torch.Tensor]:

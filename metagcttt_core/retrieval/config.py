@@ -33,7 +33,9 @@ class FilterConfig(Settings):
     scale: tuple[float, ...] | None = Field(
         None, description='factor of each position coordinate in a distance; 1 by default'
     )
-    slack: int = Field(5, ge=0, description='gcttt: steps kept beyond the goal')
+    slack: int = Field(
+        5, ge=0, description='gcttt: steps kept beyond the goal; 10 in the published grids'
+    )
     min_steps: int = Field(
         10, ge=0, description='gcttt: fewest steps to the state of highest value'
     )

@@ -3,6 +3,7 @@
 import json
 
 from metagcttt_tools import report
+from metagcttt_tools.common.differences import differences, paired_difference
 from metagcttt_tools.common.manifest import Evaluation, Manifest, Policy
 from metagcttt_tools.report import format_report, read_study
 import pytest
@@ -82,6 +83,40 @@ def test_curve_goes_from_the_base_policy_to_the_post_trained_one(study):
     assert points[1.0]['success'] == pytest.approx([0.7, 1.0])
 
 
+def test_paired_difference_by_hand():
+    # Differences .5 and .1: mean .3, standard error .2; t of one degree of freedom is 12.7062.
+    difference = paired_difference([0.2, 0.4], [0.7, 0.5])
+    assert difference.mean == pytest.approx(0.3)
+    assert difference.half_width == pytest.approx(0.2 * 12.7062, rel=1e-5)
+    assert str(difference) == '+0.300 ± 2.541'
+    assert paired_difference([0.2], [0.1]) == (pytest.approx(-0.1), None)
+    assert str(paired_difference([0.1, 0.2, 0.3], [0.4, 0.5, 0.7])) == '+0.333 ± 0.143*'
+
+
+def test_each_arm_is_paired_with_the_base_policies_of_its_seeds():
+    base = {'seeds': [0, 1], 'budgets': [0, 50, 200], 'per_seed': [[0.2, 0.4], [0.8, 0.6], [1, 1]]}
+    arm = {'seeds': [1], 'budgets': [0, 50, 200], 'per_seed': [[0.5], [0.9], [1]]}
+    found, efficiency = differences(base, arm, threshold=0.8)
+    assert list(found) == ['K = 0', 'K = 50', 'K = 200', 'AUC to 50', 'AUC to 200']
+    assert found['K = 0'].mean == pytest.approx(0.1)
+    # To 50: .7 against .5; to 200: (35 + 142.5) / 200 against (25 + 120) / 200.
+    assert found['AUC to 50'].mean == pytest.approx(0.2)
+    assert found['AUC to 200'].mean == pytest.approx(32.5 / 200)
+    assert efficiency == [4]
+
+
+def test_curve_ends_at_the_evaluated_snapshot(study):
+    path = study / 'manifest.json'
+    manifest = json.loads(path.read_text())
+    for policy in manifest['adaptations']['ttt']['policies']:
+        if policy['arm'] == 'reptile':
+            policy['fraction'] = 0.25
+    path.write_text(json.dumps(manifest))
+    points = read_study(study)['curve']['reptile']
+    assert list(points) == [0.0, 0.25, 0.5]
+    assert points[0.25]['success'] == pytest.approx([0.7, 1.0])
+
+
 def test_tables_show_every_arm(study):
     text = squeezed(format_report(read_study(study)))
     assert '| base | 2 | 0.30 ± 0.07 | 0.70 ± 0.07 | 0.90 ± 0.07 | 0.650 ± 0.071 |' in text
@@ -89,6 +124,9 @@ def test_tables_show_every_arm(study):
     assert '| fomaml-k1 | 1 | 0.00 ± 0.00 | 0.80 ± 0.00 | 0.80 ± 0.00 |' in text
     assert '| reptile | 50% | 0.40 ± 0.07 | 0.80 ± 0.07 |' in text
     assert 'metagcttt sweep --preset some-preset' in text
+    # At K = 0 +.6 and +.2: standard error .2, times 12.706.
+    assert '| reptile | 2 | +0.400 ± 2.541 | +0.200 ± 1.271 | +0.100 ± 1.271 | no step needed, 1x |' in text
+    assert '| fomaml-k1 | 1 | -0.200 | +0.200 | +0.000 | 2x |' in text
 
 
 def test_the_tool_writes_tables_and_figures(study, tmp_path, capsys):

@@ -2,10 +2,12 @@
 
 from metagcttt_tools import show_presets as presets
 from metagcttt_tools.common.cli import preset_values
-from metagcttt_tools.common.presets import load_preset, preset_names
+from metagcttt_tools.common.paper import table3
+from metagcttt_tools.common.presets import load_preset
 from metagcttt_tools.evaluate import EvaluateSettings
 from metagcttt_tools.generate import GenerateSettings
 from metagcttt_tools.meta_train import MetaTrainSettings
+from metagcttt_tools.sweep import Study, SweepSettings
 import pytest
 from sim_bridge.registry import environment_names
 from tests.tools.tables import squeezed
@@ -92,7 +94,7 @@ def test_tables_are_printed(capsys):
     assert '| antmaze-medium-stitch-v0 | gciql | 0.3 | 0.99 | 0.5 | 512 512 512 |' in printed
 
 
-@pytest.mark.parametrize('name', [name for name in preset_names() if name.startswith('paper-')])
+@pytest.mark.parametrize('name', [row.name for row in table3()])
 def test_tools_of_a_preset_fit_together(name):
     data = GenerateSettings.model_validate(preset_values(name, 'generate'))
     pretrain = presets.PretrainSettings.model_validate(preset_values(name, 'pretrain'))
@@ -110,6 +112,29 @@ def test_tools_of_a_preset_fit_together(name):
     assert training.actor_loss == evaluation.actor_loss
     assert (training.actor_loss is None) == (pretrain.agent == 'gcbc')
     assert (evaluation.ttt.batch_size, training.meta.batch_size) == (1024, 1024)
+    assert evaluation.filter.variant == training.meta.filter.variant == 'gcttt'
+    assert max(evaluation.budgets) == (50 if 'navigate' in name else 200)
+
+
+@pytest.mark.parametrize('name', sorted({row.study for row in table3()}))
+def test_study_of_a_maze_holds_its_three_rows(name):
+    study = Study(SweepSettings.model_validate(load_preset(name)['sweep']))
+    rows = {row.algorithm: row for row in table3() if row.study == name}
+    assert [run.seed for run in study.pretraining] == [0, 1, 2]
+    assert len(rows) == 3
+    for arm, run in study.post_training:
+        row = load_preset(rows[arm].name)
+        assert run.meta == MetaTrainSettings.model_validate(row['meta_train']).meta
+        assert run.checkpoint in [base.checkpoint_folder for base in study.pretraining]
+    evaluated = {}
+    for key, (run, policies) in study.evaluations.items():
+        assert run.ttt.optimizer_state == key.split('-')[0]
+        for policy in policies:
+            if policy.fraction:
+                evaluated[policy.arm] = (run.ttt.lr, round(50_000 * policy.fraction))
+                kept = policy.checkpoint.parent.name == 'snapshots'
+                assert kept == (policy.fraction < 1)
+    assert evaluated == {arm: (row.ttt_lr, row.checkpoint) for arm, row in rows.items()}
 
 
 def test_preset_is_the_caller_s_own():

@@ -14,6 +14,7 @@ from metagcttt_tools.common.presets import load_preset, preset_names
 from metagcttt_tools.sweep import is_evaluated, Study, SweepSettings
 import pytest
 from tests.core.builders import maze_walks
+from tests.tools.tables import squeezed
 import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -34,7 +35,7 @@ def preset(tmp_path):
                 'reptile': {'meta': {'algorithm': 'reptile', 'meta_lr': 0.1}},
                 'one-step': {'meta': {'inner_steps': 1, 'early_stopping': False}, 'seeds': [1]},
             },
-            'adaptations': {'full': {}, 'slow': {'lr': 1e-5}},
+            'adaptations': {'full': {}, 'slow': {'ttt': {'lr': 1e-5}}},
             'curve': [0.5],
             'curve_budgets': [0],
             'out': str(tmp_path / 'study'),
@@ -103,6 +104,57 @@ def test_manifest_names_every_policy_and_its_results(preset, tmp_path):
     ]
 
 
+def test_an_arm_holds_settings_of_every_stage(preset):
+    arms = {
+        'plain': {},
+        'near': {
+            'meta': {'outer_steps': 8, 'filter': {'slack': 10}},
+            'evaluate': {'ttt': {'lr': 0.5}, 'filter': {'slack': 10}, 'budgets': [0, 3]},
+            'snapshot': 0.75,
+            'seeds': [1],
+        },
+    }
+    study = study_of(preset, arms=arms)
+    near = next(run for name, run in study.post_training if name == 'near')
+    assert (near.meta.outer_steps, near.meta.inner_steps, near.meta.filter.slack) == (8, 2, 10)
+    assert near.snapshot_every == 2  # for half and three quarters of 8
+    assert list(study.evaluations) == ['full', 'full-near', 'slow', 'slow-near']
+    together, policies = study.evaluations['full']
+    assert {policy.arm for policy in policies} == {'base', 'plain'}
+    alone, policies = study.evaluations['full-near']
+    assert [(policy.arm, policy.fraction) for policy in policies] == [
+        *(('base', 0.0), ('base', 0.0)),
+        ('near', 0.75),
+    ]
+    assert policies[-1].checkpoint.parts[-3:] == ('near-1', 'snapshots', '000006')
+    assert (alone.ttt.lr, alone.filter.slack, alone.budgets) == (0.5, 10, (0, 3))
+    assert (together.filter.slack, together.budgets) == (5, (0, 1))
+    assert study.evaluations['slow-near'][0].ttt.lr == 1e-5  # the adaptation has the last word
+
+
+def test_an_actor_loss_for_each_stage(preset):
+    values = yaml.safe_load(preset.read_text())
+    values['pretrain']['agent'] = 'gciql'
+    preset.write_text(yaml.safe_dump(values))
+    study = study_of(
+        preset, arms={'bc': {'actor_loss': 'bc'}}, adaptations={'awr': {'actor_loss': 'awr'}}
+    )
+    assert [run.actor_loss for _, run in study.post_training] == ['bc', 'bc']
+    assert study.evaluations['awr'][0].actor_loss == 'awr'
+
+
+@pytest.mark.mujoco
+def test_dry_run_lists_what_is_left_and_runs_nothing(preset, tmp_path, capsys):
+    sweep.main(['--preset', str(preset), '--dry-run'])
+    text = squeezed(capsys.readouterr().out)
+    assert '| pretrain base-0 | 20 |' in text
+    assert '| meta-train one-step-1 | 4 |' in text
+    # 5 policies x 2 budgets x 5 tasks x 1 episode.
+    assert '| evaluate evaluation-full | 50 |' in text
+    assert 'hours of one core at most' in text
+    assert not (tmp_path / 'study').exists()
+
+
 @pytest.mark.parametrize(
     ('arm', 'message'),
     [({'algorithm': 'reptil'}, 'algorithm'), ({'inner_step': 3}, "did you mean 'inner_steps'")],
@@ -114,7 +166,7 @@ def test_a_wrong_arm_is_refused_before_anything_runs(preset, arm, message):
 
 def test_an_adaptation_cannot_set_steps_that_budgets_set(preset):
     with pytest.raises(ValueError, match="TTTSettings has no setting 'steps'"):
-        study_of(preset, adaptations={'long': {'steps': 200}})
+        study_of(preset, adaptations={'long': {'ttt': {'steps': 200}}})
 
 
 def test_curve_must_fit_the_snapshots(preset):

@@ -14,6 +14,7 @@ from pydantic import Field
 import tyro
 
 from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.differences import differences
 from metagcttt_tools.common.manifest import BASE, Evaluation, Manifest
 from metagcttt_tools.common.results import markdown_table
 
@@ -21,6 +22,12 @@ _DESCRIPTION = """Tables and figures of a study that metagcttt sweep ran.
 
 Example: metagcttt report out/study --out docs/results/study
 Prints the tables; writes OUT.json, OUT.md, OUT.png and, with a curve, OUT-curve.png."""
+
+_DIFFERENCES = (
+    'Mean difference over training seeds, each policy against the base policy it began as, ± half '
+    "the 95 percent interval of Student's t; a star where that excludes 0. It knows no spread "
+    'where all seeds differ equally. Without an interval there is one seed.'
+)
 
 Rates = dict[tuple[str, float], dict[int, dict[int, float]]]
 """Success by arm and fraction of the outer steps, then by training seed, then by budget."""
@@ -82,15 +89,17 @@ def read_study(folder: Path, threshold: float = 0.8) -> dict[str, Any]:
         `budgets`, `success` (per budget), `standard_error`, `per_seed` (per budget and seed),
         `auc`, `auc_error`, `auc_per_seed` and `efficiency`, against the base policies of the same
         seeds; `curve`: by arm, the same by fraction of the outer
-        steps, 0 being the base policy and 1 the post-trained one.
+        steps, from 0, the base policy, to that of the evaluated one.
 
     Raises:
         ValueError: If the folder holds no finished study; names the file that is missing.
     """
     manifest = Manifest.read(folder)
     adaptations = {}
+    evaluated: dict[str, float] = {}  # after which fraction of the outer steps
     for name, evaluation in manifest.adaptations.items():
         rates = _rates(folder, evaluation)
+        evaluated |= dict(rates.keys())
         arms = {arm: _summary(seeds) for (arm, _), seeds in rates.items()}
         for arm in arms.values():
             base = _summary({seed: rates[BASE, 0.0][seed] for seed in arm['seeds']})
@@ -99,20 +108,21 @@ def read_study(folder: Path, threshold: float = 0.8) -> dict[str, Any]:
         adaptations[name] = arms
     curve: dict[str, dict[float, Any]] = {}
     if manifest.curve is not None:
-        curve = _curve(_rates(folder, manifest.curve), next(iter(adaptations.values())))
+        final = next(iter(adaptations.values()))
+        curve = _curve(_rates(folder, manifest.curve), final, evaluated)
     study = manifest.model_dump(mode='json', include={'settings', 'commit', 'versions'})
     return {'study': study, 'threshold': threshold, 'adaptations': adaptations, 'curve': curve}
 
 
-def _curve(rates: Rates, final: dict[str, Any]) -> dict[str, Any]:
-    """Success by arm and fraction of the outer steps, from the base policy to the last."""
+def _curve(rates: Rates, final: dict[str, Any], evaluated: dict[str, float]) -> dict[str, Any]:
+    """Success by arm and fraction of the outer steps, from the base to the evaluated policy."""
     budgets = list(next(iter(next(iter(rates.values())).values())))
     curve: dict[str, dict[float, Any]] = {}
     for (arm, fraction), seeds in rates.items():
         curve.setdefault(arm, {0.0: _restrict(final[BASE], budgets)})[fraction] = _summary(seeds)
     for arm, points in curve.items():
-        points[1.0] = _restrict(final[arm], budgets)
-    return curve
+        points[evaluated[arm]] = _restrict(final[arm], budgets)
+    return {arm: dict(sorted(points.items())) for arm, points in curve.items()}
 
 
 def _restrict(summary: dict[str, Any], budgets: list[int]) -> dict[str, Any]:
@@ -155,7 +165,7 @@ def _by_budget(summary: dict[str, Any]) -> dict[int, float]:
     return dict(zip(summary['budgets'], summary['success'], strict=True))
 
 
-def _finite(ratio: float | None) -> float | str | None:
+def _finite(ratio: float | str | None) -> float | str | None:
     """JSON knows no infinity: a method that needs no step at all says so in words."""
     return 'no step needed' if ratio == float('inf') else ratio
 
@@ -176,6 +186,9 @@ def format_report(report: dict[str, Any]) -> str:
             f'\n\nEfficiency: smallest K with success >= {report["threshold"]:g}, '
             f'that of the base policies of the same seeds over that of the arm.'
         )
+        if len(arms) > 1:
+            parts += [f'## Against the base policies ({name})', _DIFFERENCES]
+            parts.append(_difference_table(arms, report['threshold']))
     if report['curve']:
         parts += ['## Success over post-training', _curve_table(report['curve'])]
     return '\n\n'.join(parts) + '\n'
@@ -184,9 +197,6 @@ def format_report(report: dict[str, Any]) -> str:
 def _success_table(arms: dict[str, Any]) -> str:
     rows = []
     for name, arm in arms.items():
-        efficiency = arm['efficiency'] or '-'
-        if isinstance(efficiency, float):
-            efficiency = f'{efficiency:g}x'
         rows.append(
             {
                 'policy': name,
@@ -194,9 +204,30 @@ def _success_table(arms: dict[str, Any]) -> str:
                 **_cells(arm),
                 'AUC': '' if arm['auc'] is None else f'{arm["auc"]:.3f} ± {arm["auc_error"]:.3f}',
                 'AUC by seed': ', '.join(f'{value:.3f}' for value in arm['auc_per_seed']),
-                'efficiency': efficiency,
+                'efficiency': _ratio(arm['efficiency']),
             }
         )
+    return markdown_table(rows)
+
+
+def _ratio(efficiency: float | str | None) -> str:
+    ratio = _finite(efficiency)
+    return f'{ratio:g}x' if isinstance(ratio, float) else ratio or '-'
+
+
+def _difference_table(arms: dict[str, Any], threshold: float) -> str:
+    rows = []
+    for name, arm in arms.items():
+        if name != BASE:
+            found, efficiency = differences(arms[BASE], arm, threshold)
+            rows.append(
+                {
+                    'policy': name,
+                    'seeds': len(arm['seeds']),
+                    **{figure: str(difference) for figure, difference in found.items()},
+                    'efficiency by seed': ', '.join(map(_ratio, efficiency)),
+                }
+            )
     return markdown_table(rows)
 
 

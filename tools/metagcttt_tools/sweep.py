@@ -2,7 +2,9 @@
 
 from collections.abc import Sequence
 from concurrent.futures import as_completed, ThreadPoolExecutor
+from itertools import chain
 import json
+import math
 from pathlib import Path
 import signal
 import subprocess
@@ -11,14 +13,15 @@ import threading
 from typing import Annotated, Any
 
 from metagcttt_core import MetaConfig
-from metagcttt_core.adaptation import TTTSettings
+from metagcttt_core.agents.config import ActorLoss
 from metagcttt_core.config import Settings
 from pydantic import Field, model_validator
 from tqdm import tqdm
 import tyro
 import yaml
 
-from metagcttt_tools.common.cli import fail, parse, preset_values
+from metagcttt_tools.common.cli import fail, merged, parse, preset_values
+from metagcttt_tools.common.estimate import format_estimate
 from metagcttt_tools.common.manifest import BASE, checkpoints, Evaluation, Manifest, Policy
 from metagcttt_tools.common.session import (
     provenance,
@@ -26,6 +29,7 @@ from metagcttt_tools.common.session import (
     snapshot_folder,
     sole_writer,
     stop_on_signal,
+    use_threads,
 )
 from metagcttt_tools.evaluate import EvaluateSettings
 from metagcttt_tools.meta_train import MetaTrainSettings
@@ -35,13 +39,25 @@ _DESCRIPTION = """Run a study: pre-train a policy per seed, post-train each arm,
 
 Example: metagcttt sweep --preset pointmaze-medium-navigate-study
 Each run is a folder of OUT with its own settings, logs and checkpoints. Ctrl-C is safe: the same
-command continues. `metagcttt report OUT` draws the figures and writes the tables."""
+command continues; --dry-run lists what is left and the hours it takes.
+`metagcttt report OUT` draws the figures and writes the tables."""
 
 
 class Arm(Settings):
-    """One way to post-train."""
+    """One way to post-train, and to evaluate what comes of it."""
 
     meta: dict[str, Any] = Field({}, description='changes to the meta settings of the preset')
+    actor_loss: ActorLoss | None = Field(
+        None, description="actor loss of GCIQL policies in post-training; the preset's by default"
+    )
+    evaluate: dict[str, Any] = Field(
+        {},
+        description='changes to the evaluate settings of the preset; such an arm is evaluated by '
+        'itself, beside base policies that adapt in the same way',
+    )
+    snapshot: float = Field(
+        1.0, gt=0, le=1, description='fraction of the outer steps whose policy is evaluated'
+    )
     seeds: tuple[int, ...] | None = Field(
         None, description="training seeds; the study's by default"
     )
@@ -59,13 +75,16 @@ class SweepSettings(Settings):
     adaptations: Annotated[dict[str, dict[str, Any]], tyro.conf.Fixed] = Field(
         {'ttt': {}},
         min_length=1,
-        description='ways to adapt: changes to the ttt settings of the preset',
+        description='ways to adapt: changes to the evaluate settings of the preset',
     )
     curve: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = Field(
         (), description='fractions of the outer steps at which arms of all seeds are evaluated too'
     )
     curve_budgets: tuple[int, ...] = Field((0, 20), description='budgets K along the curve')
     processes: int = Field(2, ge=1, description='runs at the same time')
+    dry_run: bool = Field(
+        False, description='list the runs and the hours they take, by rates measured here'
+    )
     out: Path = Field(Path('out/study'), description='folder of the study')
 
     @model_validator(mode='after')
@@ -84,6 +103,10 @@ def main(argv: list[str] | None = None) -> None:
     settings = parse(SweepSettings, _DESCRIPTION, 'sweep', argv)
     try:
         study = Study(settings)
+        if settings.dry_run:
+            use_threads(1)
+            print(study.estimate())
+            return
         with sole_writer(settings.out):
             study.run()
     except ValueError as error:
@@ -110,36 +133,52 @@ class Study:
             for name, arm in settings.arms.items()
             for seed in arm.seeds or settings.seeds
         ]
-        trained = [
-            *(self._policy(BASE, run, 0.0) for run in self.pretraining),
-            *(self._policy(arm, run, 1.0) for arm, run in self.post_training),
-        ]
-        self.evaluations = {
-            name: self._evaluation(f'evaluation-{name}', trained, ttt=different)
-            for name, different in settings.adaptations.items()
-        }
+        base = [self._policy(BASE, run, 0.0) for run in self.pretraining]
+        self.evaluations = {}
+        for name, different in settings.adaptations.items():
+            alike = [self._trained(arm) for arm in settings.arms if not self._is_alone(arm)]
+            self.evaluations[name] = self._evaluation(
+                f'evaluation-{name}', [*base, *chain(*alike)], different
+            )
+            for arm in filter(self._is_alone, settings.arms):
+                own = merged(settings.arms[arm].evaluate, different)
+                self.evaluations[f'{name}-{arm}'] = self._evaluation(
+                    f'evaluation-{name}-{arm}', [*base, *self._trained(arm)], own
+                )
         along = [
-            self._policy(arm, run, fraction)
-            for arm, run in self.post_training
-            if settings.arms[arm].seeds is None
+            self._policy(name, run, fraction)
+            for name, run in self.post_training
+            if settings.arms[name].seeds is None and not self._is_alone(name)
             for fraction in settings.curve
         ]
         self.curve = None
         if along:
-            self.curve = self._evaluation('curve', along, budgets=settings.curve_budgets)
+            budgets = {'budgets': settings.curve_budgets}
+            self.curve = self._evaluation('curve', along, budgets)
 
     def run(self) -> None:
         """Run whatever is not done yet."""
         out = self.settings.out
         out.mkdir(parents=True, exist_ok=True)
         self.manifest().write(out)
-        planned = [*self.evaluations.values(), *([self.curve] if self.curve else [])]
-        pending = [run for run, _ in planned if not is_evaluated(run)]
         with stop_on_signal() as stop:
             processes = self.settings.processes
             _run_all('pretrain', self.pretraining, processes, stop)
             _run_all('meta_train', [run for _, run in self.post_training], processes, stop)
-            _run_all('evaluate', pending, 1, stop)
+            _run_all('evaluate', self._not_evaluated(), 1, stop)
+
+    def estimate(self) -> str:
+        """The runs and the hours that are left of them."""
+        return format_estimate(
+            self.pretraining,
+            [run for _, run in self.post_training],
+            self._not_evaluated(),
+            self.settings.processes,
+        )
+
+    def _not_evaluated(self) -> list[EvaluateSettings]:
+        planned = [*self.evaluations.values(), *([self.curve] if self.curve else [])]
+        return [run for run, _ in planned if not is_evaluated(run)]
 
     def manifest(self) -> Manifest:
         """The policies of the study and the files of their results."""
@@ -149,11 +188,21 @@ class Study:
             return Evaluation(file=run.out.name, policies=tuple(policies))
 
         return Manifest(
-            settings=self.settings.model_dump(mode='json'),
+            settings=self.settings.model_dump(mode='json', exclude={'dry_run'}),
             **provenance(),
             adaptations={name: listed(planned) for name, planned in self.evaluations.items()},
             curve=listed(self.curve) if self.curve else None,
         )
+
+    def _is_alone(self, arm: str) -> bool:
+        """True for an arm that is evaluated in its own way."""
+        return bool(self.settings.arms[arm].evaluate)
+
+    def _trained(self, arm: str) -> list[Policy]:
+        fraction = self.settings.arms[arm].snapshot
+        return [
+            self._policy(arm, run, fraction) for name, run in self.post_training if name == arm
+        ]
 
     def _policy(self, arm: str, run: RunSettings, fraction: float) -> Policy:
         """A policy that a run leaves: its last, or one it keeps on the way."""
@@ -171,25 +220,24 @@ class Study:
 
     def _post_train(self, name: str, arm: Arm, seed: int) -> MetaTrainSettings:
         values = preset_values(self.settings.base, 'meta_train')
-        meta = MetaConfig.model_validate(values.get('meta', {}) | arm.meta)
+        meta = MetaConfig.model_validate(merged(values.get('meta', {}), arm.meta))
         base = self._pretrain(seed).checkpoint_folder
         folder = self.settings.out / f'{name}-{seed}'
         values |= {'meta': meta, 'seed': seed, 'checkpoint': base, 'out': folder, 'resume': True}
-        if self.settings.curve:
-            values['snapshot_every'] = round(meta.outer_steps * self.settings.curve[0])
+        if arm.actor_loss is not None:
+            values['actor_loss'] = arm.actor_loss
+        kept = {round(meta.outer_steps * part) for part in (*self.settings.curve, arm.snapshot)}
+        kept.discard(meta.outer_steps)
+        if kept:
+            values['snapshot_every'] = math.gcd(*kept)
         return MetaTrainSettings.model_validate(values)
 
     def _evaluation(
-        self,
-        name: str,
-        policies: Sequence[Policy],
-        ttt: dict[str, Any] | None = None,
-        **different: Any,
+        self, name: str, policies: Sequence[Policy], different: dict[str, Any]
     ) -> tuple[EvaluateSettings, Sequence[Policy]]:
-        values = preset_values(self.settings.base, 'evaluate')
-        values |= {'ttt': TTTSettings.model_validate(values.get('ttt', {}) | (ttt or {}))}
+        values = merged(preset_values(self.settings.base, 'evaluate'), different)
         values |= {'checkpoints': checkpoints(policies), 'processes': self.settings.processes}
-        values |= {'out': self.settings.out / f'{name}.json', 'resume': True, **different}
+        values |= {'out': self.settings.out / f'{name}.json', 'resume': True}
         return EvaluateSettings.model_validate(values), policies
 
 

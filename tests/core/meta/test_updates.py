@@ -110,6 +110,41 @@ def test_single_expert_is_copied_not_shared():
     assert base.actor.mean.bias.data_ptr() != adapted.actor.mean.bias.data_ptr()
 
 
+def fomaml_step(experts, **settings):
+    """The weights of a constant base after one step of TT-FOMAML."""
+    base = constant(1.0)
+    config = MetaConfig(algorithm='fomaml', **settings)
+    optimizer = make_optimizer('sgd', base.trained_parameters(), 0.1)
+    fomaml(base, experts, config, optimizer)
+    return weights_of(base)
+
+
+def test_fomaml_leaves_rejected_tasks_out_of_the_mean_on_request():
+    agents = [tiny_agent(seed=seed) for seed in (1, 2, 3)]
+    batches = [held_out_batch(agent, seed) for seed, agent in enumerate(agents)]
+
+    def experts(*best_steps):
+        return [
+            expert_of(agent, k, batch)
+            for agent, k, batch in zip(agents, best_steps, batches, strict=False)
+        ]
+
+    taken = fomaml_step(experts(4, 0, 2))
+    left_out = fomaml_step(experts(4, 0, 2), rejected='reject')
+    without = [expert for expert in experts(4, 0, 2) if expert.result.accepted]
+    assert_close(left_out, fomaml_step(without))
+    with pytest.raises(AssertionError):
+        assert_close(left_out, taken)
+    assert_bit_equal(constant(1.0), fomaml_step(experts(0, 0, 0), rejected='reject'))
+    with pytest.raises(AssertionError):
+        assert_bit_equal(constant(1.0), fomaml_step(experts(0, 0, 0)))
+
+
+def assert_close(weights, others):
+    for weight, other in zip(weights.values(), others.values(), strict=True):
+        torch.testing.assert_close(weight, other)
+
+
 @pytest.mark.parametrize('size', [1, 3])
 def test_fomaml_gradient_by_hand(size):
     """The bias of the mean head has the gradient mean(m - a), taken at the adapted weights."""

@@ -141,6 +141,7 @@ LOSSES = Walk(
 
 
 def watch_study(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    patch.setattr(sweep, 'format_estimate', lambda *runs: seen.append(runs))
     patch.setattr(
         sweep,
         '_run_all',
@@ -156,7 +157,8 @@ STUDY = Walk(
         'base': 'antmaze-medium-navigate-study',
         'seeds': [1],
         'arms': {'slow': {'meta': {'inner_lr': 1e-7}, 'seeds': [3]}},
-        'adaptations': {'actor-only': {'actor_only': True}},
+        'adaptations': {'actor-only': {'ttt': {'actor_only': True}}},
+        'dry_run': True,
         'curve': [0.5],
         'curve_budgets': Proof([7], {'curve': [0.5]}),
         'processes': 1,

@@ -120,7 +120,7 @@ def preset_values(name: str | None, section: str) -> dict[str, Any]:
     values = {} if name is None else _section(name, section)
     overrides = os.environ.get('METAGCTTT_OVERRIDES')
     if overrides and section in load_preset(overrides):
-        values = _merged(values, _section(overrides, section))
+        values = merged(values, _section(overrides, section))
     return values
 
 
@@ -136,10 +136,10 @@ def _section(name: str, section: str) -> dict[str, Any]:
     return preset[section]
 
 
-def _merged(values: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]:
+def merged(values: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]:
     """`values` with `overrides` in their place; mappings are merged key by key."""
     return values | {
-        key: _merged(values[key], value)
+        key: merged(values[key], value)
         if isinstance(value, dict) and isinstance(values.get(key), dict)
         else value
         for key, value in overrides.items()

@@ -12,6 +12,7 @@ EXTRAS = {
     'mcap_ros2': 'recordings',
     'mujoco': 'mazes',
     'ogbench': 'mazes',
+    'scipy': 'plots',
     'tensorboard': 'plots',
 }
 """The extra that brings a package, by the name under which it is imported."""

@@ -1,5 +1,8 @@
 """The paper's settings as presets: `paper-MAZE-DATA-LOSS-ALGORITHM`, one for each row of Table 3.
 
+`paper-MAZE-DATA-LOSS` is the study of its three rows on the same base policies. Trajectories are
+filtered as in the published implementation of GC-TTT; studies adapt from both optimiser states.
+
 `DATA` is `navigate` (the paper's expert data) or `stitch`; `LOSS` is that of adaptation, `bc` or
 `ddpgbc`. The values are in `paper.yaml`.
 """
@@ -13,6 +16,9 @@ import yaml
 _OUTER_STEPS, _SNAPSHOT_EVERY = 50_000, 5_000
 _HORIZON = 100
 _BATCH = 1024
+_SEEDS = [0, 1, 2]
+_FILTER = {'variant': 'gcttt'}
+_BUDGETS = {'navigate': [0, 10, 20, 50], 'stitch': [0, 10, 20, 50, 100, 200]}
 
 
 class Row(NamedTuple):
@@ -32,13 +38,51 @@ class Row(NamedTuple):
     @property
     def name(self) -> str:
         """The name of its preset."""
-        return f'paper-{self.maze}-{self.data}-{self.loss}-{self.algorithm}'
+        return f'{self.study}-{self.algorithm}'
+
+    @property
+    def study(self) -> str:
+        """The name of the preset that it shares with the other algorithms."""
+        return f'paper-{self.maze}-{self.data}-{self.loss}'
 
 
 def paper_presets() -> dict[str, dict[str, Any]]:
-    """Fresh settings of each row of Table 3, nested by tool, by name of the preset."""
+    """Fresh settings of each row of Table 3 and each study, nested by tool, by preset."""
     mazes = _read()['mazes']
-    return {row.name: _preset(row, **mazes[row.maze]) for row in table3()}
+    presets: dict[str, dict[str, Any]] = {}
+    studies: dict[str, list[Row]] = {}
+    for row in table3():
+        presets[row.name] = _preset(row, **mazes[row.maze])
+        studies.setdefault(row.study, []).append(row)
+    for name, rows in studies.items():
+        presets[name] = {**presets[rows[0].name], 'sweep': _sweep(name, rows, presets)}
+    for row in table3():
+        presets[row.name]['sweep'] = _sweep(row.name, [row], presets)
+    return presets
+
+
+def _sweep(name: str, rows: list[Row], presets: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """A study of rows, with the differences between their presets and that of the first."""
+    first = presets[rows[0].name]
+    arms: dict[str, Any] = {}
+    for row in rows:
+        preset = presets[row.name]
+        arms[row.algorithm] = {
+            'meta': preset['meta_train']['meta'],
+            'snapshot': row.checkpoint / _OUTER_STEPS,
+        }
+        ttt = preset['evaluate']['ttt']
+        if ttt != first['evaluate']['ttt']:
+            arms[row.algorithm]['evaluate'] = {'ttt': ttt}
+    return {
+        'base': rows[0].name,
+        'seeds': _SEEDS,
+        'arms': arms,
+        'adaptations': {
+            state: {'ttt': {'optimizer_state': state}} for state in ('fresh', 'pretrained')
+        },
+        'out': f'out/{name}',
+    }
 
 
 def table3() -> list[Row]:
@@ -72,6 +116,7 @@ def _preset(row: Row, environment: str, alpha: float, discount: float) -> dict[s
         'batch_size': _BATCH,
         'meta_batch_size': 1,
         'early_stopping': row.early_stopping,
+        'filter': _FILTER,
     }
     if row.algorithm != 'continual':  # which has one in the table, and no use for it
         meta['meta_lr'] = row.meta_lr
@@ -97,10 +142,11 @@ def _preset(row: Row, environment: str, alpha: float, discount: float) -> dict[s
         'evaluate': {
             'checkpoints': [f'{base}/checkpoint', f'{out}/snapshots/{row.checkpoint:06d}'],
             'dataset': dataset,
-            'budgets': [0, 10, 20, 50, 100, 200],
+            'budgets': _BUDGETS[row.data],
             'ttt': ttt,
+            'filter': _FILTER,
             'episodes': 50,
-            'seeds': [0, 1, 2],
+            'seeds': _SEEDS,
             'out': f'{out}/evaluation.json',
             **actor_loss,
         },
