@@ -14,9 +14,7 @@ Reaction = Literal['zeros', 'hold', 'nothing']
 """What a command topic gets instead of the policy's command: zeros at once, the last command
 again, or no message."""
 
-TopicName = Annotated[
-    str, Field(pattern=r'^[~/]?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*$')
-]
+TopicName = Annotated[str, Field(pattern=r'^/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*$')]
 TypeName = Annotated[str, Field(pattern=r'^[a-z][a-z0-9_]*/msg/[A-Z][A-Za-z0-9]*$')]
 FieldPath = Annotated[str, Field(pattern=r'^[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*$')]
 
@@ -260,6 +258,11 @@ class Contract(Settings):
         """The names of the values of an observation."""
         values = chain.from_iterable(topic.values for topic in self.observe)
         return list(chain.from_iterable(value.columns for value in values))
+
+    @property
+    def topics(self) -> list[ObservedTopic | CommandTopic]:
+        """All topics, those that are read first."""
+        return [*self.observe, *self.act]
 
     @property
     def obs_dim(self) -> int:

@@ -29,8 +29,11 @@ def type_faults(contract: Contract, definitions: Definitions) -> list[str]:
         contract: The contract.
         definitions: Where the message types are defined: ROS, or a bag.
     """
-    topics: list[ObservedTopic | CommandTopic] = [*contract.observe, *contract.act]
-    return [f'{topic.topic}: {fault}' for topic in topics for fault in _faults(topic, definitions)]
+    return [
+        f'{topic.topic}: {fault}'
+        for topic in contract.topics
+        for fault in _faults(topic, definitions)
+    ]
 
 
 def has_header(type_name: str, definitions: Definitions) -> bool:

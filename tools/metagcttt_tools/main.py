@@ -37,6 +37,7 @@ PROGRAMS: dict[str, Program | Group] = {
     'generate': Program('generate', 'Generate an offline dataset of a maze.'),
     'download': Program('download', "Download one of OGBench's published datasets."),
     'import-recordings': Program('import_recordings', 'Turn recordings into a dataset.'),
+    'import-bags': Program('import_bags', 'Turn bags of a robot into a dataset, by its contract.'),
     'pretrain': Program('pretrain', 'Pre-train a policy on an offline dataset.'),
     'convert': Program('convert', "Convert a policy trained with OGBench's own code."),
     'meta-train': Program('meta_train', 'Meta-post-train a policy (Algorithm 1).'),
@@ -62,6 +63,10 @@ PROGRAMS: dict[str, Program | Group] = {
         },
         'Measure speed against a baseline in the same run.',
     ),
+    'contract': Group(
+        {'check': Program('contract_check', 'Check a contract, and whether a bag satisfies it.')},
+        'Contracts of robots: what is read and written on which topics.',
+    ),
     'controller': Group(
         {
             'train': Program('controller_train', "Train the ant's controller (SAC)."),
@@ -86,6 +91,7 @@ EXTRAS = {
     'mcap_ros2': 'recordings',
     'mujoco': 'mazes',
     'ogbench': 'mazes',
+    'rosbags': 'recordings',
     'tensorboard': 'plots',
 }
 _ROS = frozenset({'domain_coordinator', 'metagcttt', 'metagcttt_interfaces', 'rclpy'})

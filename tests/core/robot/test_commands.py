@@ -14,6 +14,7 @@ from metagcttt_core.robot.commands import (
 )
 import numpy as np
 import pytest
+
 from tests.core.robot.messages import ARM, contract, joints, SECOND
 
 STEP = SECOND // 10

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from metagcttt_core.robot import Contract, ContractError, load_contract
 import pytest
+
 from tests.core.robot.messages import ARM, contract, DRIVE, ROBOTS
 
 FILES = sorted(ROBOTS.glob('*.yaml'))

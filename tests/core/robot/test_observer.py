@@ -5,6 +5,7 @@ from types import SimpleNamespace
 from metagcttt_core.robot import Observer
 import numpy as np
 import pytest
+
 from tests.core.robot.messages import ARM, contract, joints, odometry, SECOND
 
 STEP = SECOND // 10
