@@ -38,6 +38,7 @@ PROGRAMS: dict[str, Program | Group] = {
     'generate': Program('generate', 'Generate an offline dataset of a maze.'),
     'download': Program('download', "Download one of OGBench's published datasets."),
     'import-recordings': Program('import_recordings', 'Turn recordings into a dataset.'),
+    'import-bags': Program('import_bags', 'Turn bags of a robot into a dataset, by its contract.'),
     'pretrain': Program('pretrain', 'Pre-train a policy on an offline dataset.'),
     'convert': Program('convert', "Convert a policy trained with OGBench's own code."),
     'meta-train': Program('meta_train', 'Meta-post-train a policy (Algorithm 1).'),
@@ -63,6 +64,10 @@ PROGRAMS: dict[str, Program | Group] = {
             'training': Program('benchmarks.training', 'Milliseconds per gradient step.'),
         },
         'Measure speed against a baseline in the same run.',
+    ),
+    'contract': Group(
+        {'check': Program('contract_check', 'Check a contract, and whether a bag satisfies it.')},
+        'Contracts of robots: what is read and written on which topics.',
     ),
     'controller': Group(
         {

@@ -1,25 +1,31 @@
 """Every setting of what makes data, controllers and pictures of them, or converts and packs."""
 
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
 
 from metagcttt_tools import (
+    contract_check,
     controller_measure,
     controller_train,
     diagnostics,
     download,
     generate,
+    import_bags,
     top_view,
 )
 from metagcttt_tools.common import plots
 from metagcttt_tools.controller import humanoid
 from metagcttt_tools.recordings import goal_views, trajectories
+from metagcttt_tools.robots import bag, episodes, report
+import numpy as np
 import ogbench
 import pytest
 from sim_bridge.controllers.direction import BUNDLED
 from sim_bridge.controllers.walk import GoalRun
 from tests.core.builders import random_dataset
+from tests.core.robot.messages import contract
 from tests.tools.settings.walk import Proof, Seen, ShortSimulator, Walk, walks_through
 import torch.utils.tensorboard
 
@@ -88,6 +94,57 @@ IMPORT = Walk(
         'overwrite': Proof(True, again=True),
     },
     watch_import,
+)
+
+CART = contract()
+
+
+def watch_contract(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    patch.setattr(contract_check, 'load_contract', lambda path: seen.append(path) or CART)
+    patch.setattr(bag, 'open_bag', lambda path, contract, *given: end(seen.append((path, given))))
+
+
+def end(_: object) -> None:
+    raise SystemExit(0)
+
+
+CONTRACT_CHECK = Walk(
+    'contract check',
+    {},
+    {
+        'file': 'elsewhere.yaml',
+        'bag': 'drive.mcap',
+        'namespace': Proof('cart1', {'bag': 'drive.mcap'}),
+    },
+    watch_contract,
+)
+
+
+def watch_bags(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    def note(path, contract, *given):
+        seen.append((path, given))
+        return nullcontext(mock.Mock(types={}))
+
+    trajectory = (np.arange(12.0).reshape(3, 4), np.zeros((3, 2)))
+    patch.setattr(import_bags, 'load_contract', lambda path: seen.append(path) or CART)
+    patch.setattr(bag, 'open_bag', note)
+    patch.setattr(report, 'bag_faults', lambda *_: [])
+    patch.setattr(
+        episodes, 'read_episodes', lambda *_: episodes.Episodes({}, trajectories=[trajectory])
+    )
+
+
+IMPORT_BAGS = Walk(
+    'import-bags',
+    {'bags': ['a.mcap']},
+    {
+        'contract': 'elsewhere.yaml',
+        'bags': ['a.mcap', 'b.mcap'],
+        'namespace': 'cart1',
+        'out': 'elsewhere.npz',
+        'overwrite': Proof(True, again=True),
+    },
+    watch_bags,
 )
 WITH_CRITIC = {'agent': 'gciql', 'file': '@nets_gciql_pm.npz'}
 CONVERT = Walk(
@@ -297,6 +354,8 @@ WALKS = (
     GENERATE,
     DOWNLOAD,
     IMPORT,
+    IMPORT_BAGS,
+    CONTRACT_CHECK,
     CONVERT,
     PACK,
     DIAGNOSTICS,

@@ -12,6 +12,7 @@ EXTRAS = {
     'mcap_ros2': 'recordings',
     'mujoco': 'mazes',
     'ogbench': 'mazes',
+    'rosbags': 'recordings',
     'scipy': 'plots',
     'tensorboard': 'plots',
 }

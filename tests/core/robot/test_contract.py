@@ -1,0 +1,120 @@
+"""Contracts are read as a whole; every mistake has its line and says what is accepted."""
+
+import json
+from pathlib import Path
+
+from metagcttt_core.robot import Contract, ContractError, load_contract
+import pytest
+
+from tests.core.robot.messages import ARM, contract, DRIVE, ROBOTS
+
+FILES = sorted(ROBOTS.glob('*.yaml'))
+
+
+def test_starting_contracts_load():
+    dims = {file.stem: load_contract(file) for file in FILES}
+    assert {name: (c.obs_dim, c.act_dim) for name, c in dims.items()} == {
+        'arm6': (12, 6),
+        'diffdrive': (6, 2),
+        'quadruped': (37, 12),
+        'turtlebot3': (6, 2),
+        'turtlebot3-humble': (6, 2),
+    }
+
+
+@pytest.mark.parametrize('file', FILES, ids=lambda file: file.stem)
+def test_starting_contracts_point_editors_to_the_schema(file):
+    first = file.read_text().splitlines()[0]
+    assert first == '# yaml-language-server: $schema=contract.schema.json'
+
+
+def test_committed_schema_is_that_of_the_settings():
+    committed = json.loads((ROBOTS / 'contract.schema.json').read_text())
+    assert committed == Contract.model_json_schema()
+
+
+def test_columns_are_named_in_order():
+    assert contract().columns == ['x', 'y', 'yaw.cos', 'yaw.sin']
+    assert contract(ARM).columns == ['a.position', 'b.position']
+    assert contract(ARM).act_dim == 2
+
+
+@pytest.mark.parametrize(
+    ('old', 'new', 'line', 'message'),
+    [
+        ('rate_hz: 10', 'rate_hz: fast', 3, 'rate_hz: Input should be a valid number'),
+        ('rate_hz: 10', 'rate_hz: 0', 3, 'rate_hz: Input should be greater than 0, got 0'),
+        ('stamp: header', 'stamp: heder', 9, "stamp: Input should be 'header' or 'receive'"),
+        ('stamp: header', 'stmp: header', 9, "no setting 'stmp'; did you mean 'stamp'?"),
+        ('frame_id: odom', 'topic: odom', 8, 'topic is given twice'),
+        ('name: x', 'name: y', 2, 'several observed values are named y'),
+        ('[x, y]', '[x, z]', 2, 'no observed value is named z (there are: x, y, yaw.cos'),
+        ('low: -2,', 'low: 2,', 19, 'low must be below high'),
+        ('low: -2,', 'low: 1,', 15, 'zeros is outside the limits of angular.z; use hold'),
+        ('low: -2,', 'low: [-2, 1],', 19, 'low needs 1 or 1 numbers, got 2'),
+        ('low: -2,', 'low: .nan,', 19, 'finite number'),
+        ('fallback: zeros', 'fallback: stop', 20, "Input should be 'zeros', 'hold' or 'nothing'"),
+        ('field: linear.x', 'field: Linear-x', 18, 'String should match pattern'),
+        ('/msg/Twist', '/Twist', 16, 'String should match pattern'),
+        ('topic: odom', 'topic: [odom', 7, 'not valid YAML'),
+        ('max_rate: 1.0', 'max_rate: 0', 18, 'max_rate must be positive'),
+        ('stamp: header', 'stamp: header\n    timeout_s: -1', 10, 'timeout_s: Input should be gr'),
+        ('fallback: zeros', 'fallback: zeros\n    timeout_s: 0.05', 2, 'shorter than a period'),
+        ('transform: heading', 'transform: heading, size: 3', 13, 'a heading has no joints'),
+    ],
+)
+def test_mistakes_are_named_with_their_line(tmp_path: Path, old, new, line, message):
+    assert old in DRIVE
+    file = tmp_path / 'robot.yaml'
+    file.write_text(DRIVE.replace(old, new, 1))
+    with pytest.raises(ContractError) as caught:
+        load_contract(file)
+    found = str(caught.value).splitlines()
+    assert any(each.startswith(f'{file}:{line}: ') and message in each for each in found), found
+
+
+def test_every_mistake_is_named_at_once(tmp_path: Path):
+    file = tmp_path / 'robot.yaml'
+    file.write_text(
+        DRIVE.replace('rate_hz: 10', 'rate_hz: 0').replace('stamp: header', 'stamp: 1')
+    )
+    with pytest.raises(ContractError) as caught:
+        load_contract(file)
+    assert [line.split(':')[1] for line in str(caught.value).splitlines()] == ['3', '9']
+
+
+def test_contract_about_nothing_is_refused(tmp_path: Path):
+    file = tmp_path / 'robot.yaml'
+    file.write_text('robot: a\nrate_hz: 1\nobserve: []\nact: []\n')
+    with pytest.raises(ContractError) as caught:
+        load_contract(file)
+    assert [line.split(':')[1] for line in str(caught.value).splitlines()] == ['3', '4']
+
+
+@pytest.mark.parametrize(
+    ('content', 'message'),
+    [(None, 'cannot be read'), ('- 1', 'a mapping'), ('', 'a mapping'), ('a: !x 1', 'not valid')],
+)
+def test_files_that_hold_no_contract_are_refused(tmp_path: Path, content, message):
+    file = tmp_path / 'robot.yaml'
+    if content is not None:
+        file.write_text(content)
+    with pytest.raises(ContractError, match=message):
+        load_contract(file)
+
+
+@pytest.mark.parametrize(
+    ('old', 'new', 'message'),
+    [
+        ('joints: [a, b]', 'joints: [a, a]', 'joints names a more than once'),
+        ('joints: [a, b]', 'joints: [a, b], size: 2', 'joints or size, not both'),
+        ('joints: [a, b]', 'joints: [a, b], origin: 1', 'have no origin'),
+        ('measured: position', 'measured: effort', 'no observed value is named b.effort'),
+        ('joints: [b, a]', 'size: 2', 'measured takes joints'),
+        ('high: [3, 2]', 'high: [3, 2, 1]', 'high needs 1 or 2 numbers, got 3'),
+    ],
+)
+def test_joints_that_do_not_fit_are_refused(old, new, message):
+    assert old in ARM
+    with pytest.raises(ValueError, match=message):
+        contract(ARM.replace(old, new, 1))

@@ -1,0 +1,200 @@
+"""Bags as people have them become datasets by a contract, and what does not fit it is named."""
+
+from pathlib import Path
+
+from metagcttt_core import TrajectoryDataset
+from metagcttt_tools.main import main
+import numpy as np
+import pytest
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
+from tests.core.robot.messages import ARM, DRIVE
+from tests.tools.robots.bags import drive, joint_state, make, odometry, STEP, T0, twist, write
+
+
+@pytest.fixture
+def contract_file(tmp_path: Path) -> Path:
+    file = tmp_path / 'cart.yaml'
+    file.write_text(DRIVE)
+    return file
+
+
+def convert(contract_file: Path, *bags: Path, more: tuple[str, ...] = ()) -> TrajectoryDataset:
+    out = contract_file.parent / 'out.npz'
+    arguments = ['--contract', str(contract_file), '--bags', *map(str, bags), *more]
+    main(['import-bags', *arguments, '--out', str(out), '--overwrite'])
+    return TrajectoryDataset.load(out)
+
+
+def complaint(contract_file: Path, bag: Path, capsys: pytest.CaptureFixture) -> str:
+    with pytest.raises(SystemExit, match='2'):
+        convert(contract_file, bag)
+    return capsys.readouterr().err
+
+
+def files_of(bag: Path) -> list[Path]:
+    return [path for path in bag.iterdir() if path.suffix in ('.mcap', '.db3')]
+
+
+@pytest.mark.parametrize('storage', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+@pytest.mark.parametrize('compression', [CompressionMode.NONE, CompressionMode.FILE])
+def test_drive_becomes_a_trajectory(contract_file, tmp_path, storage, compression):
+    bag = write(tmp_path / 'bag', drive(), storage, compression)
+    dataset = convert(contract_file, bag)
+    assert (dataset.num_episodes, dataset.num_transitions) == (1, 19)
+    steps = np.arange(20)
+    np.testing.assert_allclose(dataset.observations[:, 0], 0.05 * steps, atol=1e-6)
+    assert (dataset.observations[:, 1] == 0).all()  # the origin is taken off
+    np.testing.assert_allclose(dataset.observations[:, 2], np.cos(0.1 * steps), atol=1e-6)
+    # -0.5 to 1 and -2 to 2 became -1 to 1; each row has the command that followed it.
+    np.testing.assert_allclose(dataset.actions[:-1, 0], 1 / 3, atol=1e-6)
+    np.testing.assert_allclose(dataset.actions[:-1, 1], (0.1 * steps[:-1] - 1) / 2, atol=1e-6)
+
+
+@pytest.mark.parametrize('storage', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_single_file_is_a_bag(contract_file, tmp_path, storage):
+    bag = write(tmp_path / 'bag', drive(), storage)
+    assert convert(contract_file, *files_of(bag)).num_transitions == 19
+
+
+def test_bags_follow_one_another_and_robots_have_namespaces(contract_file, tmp_path):
+    named = [(f'/cart1{topic}', *rest) for topic, *rest in drive(6)]
+    bags = [write(tmp_path / f'bag{n}', named) for n in range(2)]
+    dataset = convert(contract_file, *bags, more=('--namespace', 'cart1'))
+    assert (dataset.num_episodes, dataset.num_transitions) == (2, 10)
+
+
+def test_gap_cuts_the_trajectory(contract_file, tmp_path):
+    gap = range(T0 + 8 * STEP - 1, T0 + 16 * STEP)
+    kept = [m for m in drive(30) if m[0] != '/odom' or m[2] not in gap]
+    dataset = convert(contract_file, write(tmp_path / 'bag', kept))
+    assert dataset.num_episodes == 2
+    assert dataset.observations[dataset.episode_starts[1], 0] == pytest.approx(0.05 * 16)
+
+
+def test_rows_without_a_command_are_left_out(contract_file, tmp_path):
+    """The first command comes late, and the cart is no longer commanded at the end."""
+    commanded = range(T0 + 5 * STEP, T0 + 10 * STEP)
+    kept = [m for m in drive(30) if m[0] == '/odom' or m[2] in commanded]
+    dataset = convert(contract_file, write(tmp_path / 'bag', kept))
+    assert dataset.num_episodes == 1
+    x = dataset.observations[:, 0]
+    assert x[0] == pytest.approx(0.05 * 5)
+    assert x[-1] == pytest.approx(0.05 * 15)  # the last command held for its time-out
+
+
+def test_joints_are_mapped_by_name(tmp_path):
+    file = tmp_path / 'arm.yaml'
+    file.write_text(ARM)
+    layout = make('std_msgs/msg/MultiArrayLayout', dim=[], data_offset=0)
+    messages = []
+    for step in range(5):
+        now = T0 + step * STEP
+        orders = (['a', 'b'], [1.0, 2.0]), (['b', 'a'], [2.0, 1.0])
+        messages.append(('/joint_states', joint_state(now, *orders[step % 2]), now))
+        target = make('std_msgs/msg/Float64MultiArray', layout=layout, data=np.array([3.0, -3.0]))
+        messages.append(('/targets', target, now + 1))
+    dataset = convert(file, write(tmp_path / 'bag', messages))
+    assert dataset.observations.tolist() == [[1.0, 2.0]] * 5
+    assert dataset.actions[:-1].tolist() == [[1.0, -1.0]] * 4
+
+
+def test_command_beyond_the_limits_is_refused_and_not_clipped(contract_file, tmp_path, capsys):
+    bag = write(tmp_path / 'bag', drive(speed=1.2))
+    error = complaint(contract_file, bag, capsys)
+    assert f'{bag}: cmd_vel, message 1: commands [1.2, -1.0], outside the limits' in error
+
+
+@pytest.mark.parametrize(
+    ('messages', 'error'),
+    [
+        (drive()[::2], 'cmd_vel: not in the bag (there are: /odom (nav_msgs/msg/Odometry))'),
+        (
+            [*drive()[1::2], ('/odom', twist(0.0, 0.0), T0)],
+            'odom: of type geometry_msgs/msg/Twist in the bag, not nav_msgs/msg/Odometry',
+        ),
+        (
+            [(t, m, n + 100 * 10**9) for t, m, n in drive()],
+            'no control period has both an observation and a command',
+        ),
+    ],
+)
+def test_bag_that_does_not_fit_is_refused(contract_file, tmp_path, capsys, messages, error):
+    assert error in complaint(contract_file, write(tmp_path / 'bag', messages), capsys)
+
+
+def test_missing_and_damaged_bags_are_named(contract_file, tmp_path, capsys):
+    assert 'no such bag' in complaint(contract_file, tmp_path / 'none', capsys)
+    [file] = files_of(write(tmp_path / 'bag', drive()))
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2])
+    assert f'{file}: cannot be read as a bag' in complaint(contract_file, file, capsys)
+    file.write_text('text')
+    assert f'{file}: cannot be read as a bag' in complaint(contract_file, file, capsys)
+
+
+def test_existing_dataset_stays(contract_file, tmp_path, capsys):
+    bag = write(tmp_path / 'bag', drive())
+    convert(contract_file, bag)
+    arguments = ['--contract', str(contract_file), '--bags', str(bag)]
+    with pytest.raises(SystemExit, match='2'):
+        main(['import-bags', *arguments, '--out', str(tmp_path / 'out.npz')])
+    assert 'give --overwrite' in capsys.readouterr().err
+    with pytest.raises(SystemExit, match='2'):
+        main(['import-bags', '--contract', str(contract_file), '--out', str(tmp_path / 'x.npz')])
+    assert 'no bags were given' in capsys.readouterr().err
+
+
+class TestContractCheck:
+    def check(self, contract_file: Path, bag: Path | None, capsys, status: int = 0):
+        arguments = ['contract', 'check', str(contract_file)]
+        arguments += ['--bag', str(bag)] if bag else []
+        if status:
+            with pytest.raises(SystemExit, match=str(status)):
+                main(arguments)
+        else:
+            main(arguments)
+        return capsys.readouterr()
+
+    def test_says_what_is_read_and_written(self, contract_file, capsys):
+        text = self.check(contract_file, None, capsys).out
+        assert 'cart: 4 observed and 2 commanded values at 10 Hz' in text
+        assert 'yaw.sin' in text
+        assert 'cmd_vel without a command: fault zeros, silent zeros' in text
+
+    def test_says_what_a_bag_holds(self, contract_file, tmp_path, capsys):
+        text = self.check(contract_file, write(tmp_path / 'bag', drive()), capsys).out
+        assert '20 of 20 periods have an observation; 19 transitions in 1 trajectories' in text
+        assert ['odom', '20', '10.0', '0'] in [line.split() for line in text.splitlines()]
+
+    @pytest.mark.parametrize(
+        ('old', 'new', 'error'),
+        [
+            ('pose.position.x', 'pose.place.x', 'geometry_msgs/msg/Pose has no field place'),
+            ('linear.x', 'linear', 'geometry_msgs/msg/Vector3 is no number'),
+            ('pose.pose.orientation', 'pose.pose.position', 'a heading is read of a quaternion'),
+            ('field: linear.x', 'field: linear.x, size: 1', 'one number has no joints'),
+            ('{field: pose.pose.position.x, name: x', '{field: pose.covariance, name: x', 'array'),
+            ('Twist\n', 'Twist\n    frame_id: base\n', 'frame_id: geometry_msgs/msg/Twist has no'),
+            ('nav_msgs/msg/Odometry', 'nav_msgs/msg/Odo', 'type nav_msgs/msg/Odo is not known'),
+            ('nav_msgs/msg/Odometry', 'geometry_msgs/msg/Pose', 'stamp header: geometry_msgs/ms'),
+        ],
+    )
+    def test_fields_are_those_of_the_types(self, contract_file, capsys, old, new, error):
+        assert old in DRIVE
+        contract_file.write_text(DRIVE.replace(old, new, 1))
+        assert error in self.check(contract_file, None, capsys, status=2).err
+
+    def test_messages_that_do_not_fit_are_counted(self, contract_file, tmp_path, capsys):
+        messages = drive()
+        messages[4] = ('/odom', odometry(T0 + 2 * STEP, x=float('nan')), T0 + 2 * STEP)
+        error = self.check(contract_file, write(tmp_path / 'bag', messages), capsys, 2).err
+        assert '1 of 20 refused, first: odom: pose.pose.position.x is not finite' in error
+
+    @pytest.mark.parametrize('name', ['arm6', 'diffdrive', 'quadruped', 'turtlebot3'])
+    def test_starting_contracts_have_fields_of_their_types(self, name, capsys):
+        root = Path(__file__).parents[3]
+        self.check(root / 'config' / 'robots' / f'{name}.yaml', None, capsys)
+
+    def test_wrong_contract_is_named_with_its_line(self, contract_file, capsys):
+        contract_file.write_text(DRIVE.replace('rate_hz: 10', 'rate_hz: 0'))
+        assert f'{contract_file}:3: rate_hz' in self.check(contract_file, None, capsys, 2).err

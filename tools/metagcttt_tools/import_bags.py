@@ -1,0 +1,64 @@
+"""Turn bags of a robot into a dataset, by its contract."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from metagcttt_core.config import Settings
+from metagcttt_core.data import DatasetError
+from metagcttt_core.robot import ContractError, load_contract
+from pydantic import Field
+
+from metagcttt_tools.common.cli import fail, parse
+
+_DESCRIPTION = """Turn bags of a robot into a dataset (.npz), by its contract.
+
+Example: metagcttt import-bags --contract config/robots/turtlebot3.yaml --bags drive.mcap
+A row a control period; the action is the first command after the observation. Where one of them
+is missing, the trajectory is cut. What was left out is printed."""
+
+
+class BagSettings(Settings):
+    """Settings of the program."""
+
+    contract: Path = Field(Path('robot.yaml'), description="the robot's contract (YAML)")
+    bags: tuple[Path, ...] = Field(
+        (), description='recordings: folders of ros2 bag, .mcap or .db3 files'
+    )
+    namespace: str = Field('', description='namespace of the robot in the bags')
+    out: Path = Field(Path('data/robot.npz'), description='dataset to write')
+    overwrite: bool = Field(False, description='replace an existing dataset')
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run the program."""
+    settings = parse(BagSettings, _DESCRIPTION, 'import-bags', argv)
+    from metagcttt_tools.recordings.trajectories import join_datasets
+    from metagcttt_tools.robots.bag import open_bag
+    from metagcttt_tools.robots.episodes import read_episodes
+    from metagcttt_tools.robots.report import bag_faults, describe_bag
+
+    if settings.out.exists() and not settings.overwrite:
+        fail(f'{settings.out} exists: give --overwrite or another --out')
+    if not settings.bags:
+        fail('no bags were given: --bags FILE...')
+    datasets = []
+    try:
+        contract = load_contract(settings.contract)
+        for path in settings.bags:
+            with open_bag(path, contract, settings.namespace) as bag:
+                if faults := bag_faults(contract, bag):
+                    fail(*(f'{path}: {fault}' for fault in faults))
+                found = read_episodes(contract, bag.messages())
+                datasets.append(found.dataset())
+            print(f'{path}\n{describe_bag(found)}')
+            for count in found.counts.values():
+                if count.refused:
+                    print(f'  left out: {count.refused} messages, first: {count.reason}')
+    except ContractError as error:
+        fail(*str(error).splitlines())
+    except DatasetError as error:
+        fail(str(error))
+    dataset = join_datasets(datasets)
+    dataset.save(settings.out)
+    print(f'{dataset}: {settings.out}')

@@ -1,0 +1,1 @@
+"""Recordings of robots that speak standard messages, read by their contracts."""

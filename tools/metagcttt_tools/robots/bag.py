@@ -1,0 +1,115 @@
+"""Bags as recorded by ROS: folders, .mcap, .db3, split or compressed. No ROS."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+import struct
+from typing import Any, NamedTuple
+
+from metagcttt_core.data import DatasetError
+from metagcttt_core.robot import Contract
+from metagcttt_core.robot.types import FieldType
+from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.interfaces import Nodetype
+from rosbags.rosbag2 import ReaderError
+from rosbags.serde import SerdeError
+from rosbags.typesys import get_typestore, Stores
+from rosbags.typesys.store import Typestore
+
+
+class Recorded(NamedTuple):
+    """A message with its topic, as the contract names it, and the time of its reception."""
+
+    topic: str
+    message: Any
+    received_ns: int
+
+
+class Definitions:
+    """The message types that a bag, or by default ROS 2 Jazzy, defines."""
+
+    def __init__(self, types: Typestore | None = None) -> None:
+        """Use the types of a bag, or the standard ones."""
+        self._types = types or get_typestore(Stores.ROS2_JAZZY)
+
+    def __call__(self, type_name: str) -> Mapping[str, FieldType]:
+        """The fields of a message type by name; raises KeyError for an unknown one."""
+        _, fields = self._types.fielddefs[type_name]
+        return {name: _field_type(kind, content) for name, (kind, content) in fields}
+
+
+class Bag:
+    """An open bag, seen through a contract.
+
+    Attributes:
+        types: The type of each topic of the contract that is in the bag.
+        definitions: The message types that the bag defines.
+    """
+
+    def __init__(self, reader: AnyReader, contract: Contract, namespace: str) -> None:
+        """Find the topics of a contract in an open bag."""
+        topics = [topic.topic for topic in contract.topics]
+        names = {resolved(topic, namespace): topic for topic in topics}
+        self._reader = reader
+        self._connections = {
+            connection.id: (names[connection.topic], connection)
+            for connection in reader.connections
+            if connection.topic in names
+        }
+        self._names = names
+        self.types = {topic: each.msgtype for topic, each in self._connections.values()}
+        self.all_topics = {each.topic: each.msgtype for each in reader.connections}
+        self.definitions = Definitions(reader.typestore)
+
+    def messages(self) -> Iterator[Recorded]:
+        """The messages of the contract's topics in the order of reception."""
+        connections = [connection for _, connection in self._connections.values()]
+        if not connections:
+            return
+        for connection, received_ns, data in self._reader.messages(connections):
+            message = self._reader.deserialize(data, connection.msgtype)
+            yield Recorded(self._names[connection.topic], message, received_ns)
+
+
+def resolved(topic: str, namespace: str) -> str:
+    """The full name of a topic; relative ones are below the namespace."""
+    if topic.startswith('/'):
+        return topic
+    namespace = namespace.strip('/')
+    return f'/{namespace}/{topic}' if namespace else f'/{topic}'
+
+
+@contextmanager
+def open_bag(path: Path, contract: Contract, namespace: str = '') -> Iterator[Bag]:
+    """A bag while it is read.
+
+    Args:
+        path: Folder with `metadata.yaml`, or an .mcap or .db3 file. Bags of Humble hold no
+            definitions of types; the standard ones of Humble stand in.
+        contract: The contract, whose topics are wanted.
+        namespace: Namespace of the robot in the bag.
+
+    Raises:
+        DatasetError: If the bag is missing or damaged, also while it is read.
+    """
+    try:
+        humble = get_typestore(Stores.ROS2_HUMBLE)
+        with AnyReader([path], default_typestore=humble) as reader:
+            yield Bag(reader, contract, namespace)
+    except DatasetError as error:
+        raise DatasetError(f'{path}: {error}') from error
+    except FileNotFoundError as error:
+        raise DatasetError(f'{path}: no such bag ({error})') from error
+    # The packages below raise any of these for damaged files and messages.
+    except (
+        *(AnyReaderError, ReaderError, SerdeError, OSError, struct.error, RuntimeError),
+        *(AssertionError, LookupError, OverflowError, MemoryError, UnicodeDecodeError),
+    ) as error:
+        raise DatasetError(f'{path}: cannot be read as a bag ({error})') from error
+
+
+def _field_type(kind: Nodetype, content: Any) -> FieldType:
+    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        (inner, name), _ = content
+        return FieldType(_field_type(inner, name).name, is_array=True)
+    return FieldType(content if kind == Nodetype.NAME else content[0])
