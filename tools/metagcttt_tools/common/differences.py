@@ -67,9 +67,11 @@ def differences(
             found[f'AUC to {last}'] = paired_difference(*areas)
     efficiency = [
         adaptation_efficiency(
-            *(dict(zip(budgets, rates, strict=True)) for rates in pair), threshold
+            dict(zip(budgets, base_rates, strict=True)),
+            dict(zip(budgets, arm_rates, strict=True)),
+            threshold,
         )
-        for pair in zip(before.T, after.T, strict=True)
+        for base_rates, arm_rates in zip(before.T, after.T, strict=True)
     ]
     return found, efficiency
 
