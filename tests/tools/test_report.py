@@ -125,8 +125,10 @@ def test_tables_show_every_arm(study):
     assert '| reptile | 50% | 0.40 ± 0.07 | 0.80 ± 0.07 |' in text
     assert 'metagcttt sweep --preset some-preset' in text
     # At K = 0 +.6 and +.2: standard error .2, times 12.706.
-    reptile = '+0.400 ± 2.541 | +0.200 ± 1.271 | +0.100 ± 1.271 | no step needed, 1x'
-    assert f'| reptile | 2 | {reptile} |' in text
+    assert (
+        '| reptile | 2 | +0.400 ± 2.541 | +0.200 ± 1.271 | +0.100 ± 1.271 | no step needed, 1x |'
+        in text
+    )
     assert '| fomaml-k1 | 1 | -0.200 | +0.200 | +0.000 | 2x |' in text
 
 

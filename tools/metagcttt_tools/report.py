@@ -15,13 +15,16 @@ import tyro
 
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.differences import differences
+from metagcttt_tools.common.evidence import format_evidence, read_evidence
 from metagcttt_tools.common.manifest import BASE, Evaluation, Manifest
 from metagcttt_tools.common.results import markdown_table
 
 _DESCRIPTION = """Tables and figures of a study that metagcttt sweep ran.
 
 Example: metagcttt report out/study --out docs/results/study
-Prints the tables; writes OUT.json, OUT.md, OUT.png and, with a curve, OUT-curve.png."""
+Prints the tables; writes OUT.json, OUT.md, OUT.png and, with a curve, OUT-curve.png.
+With --paper it rebuilds the page on the paper's claims, and tables and figures from the results it
+names, in the folder OUT of paper.yaml."""
 
 _DIFFERENCES = (
     'Mean difference over training seeds, each policy against the base policy it began as, ± half '
@@ -38,6 +41,9 @@ class ReportSettings(Settings):
 
     study: tyro.conf.Positional[Path] = Field(Path('out/study'), description='folder of the study')
     out: Path | None = Field(None, description='files to write; STUDY/report by default')
+    paper: bool = Field(
+        False, description='rebuild all that paper.yaml in OUT (docs/results) lists, from results'
+    )
     threshold: float = Field(
         0.8, gt=0, le=1, description='success rate that adaptation efficiency counts steps to'
     )
@@ -46,21 +52,49 @@ class ReportSettings(Settings):
 def main(argv: list[str] | None = None) -> None:
     """Run the program."""
     settings = parse(ReportSettings, _DESCRIPTION, 'report', argv)
-    from metagcttt_tools.common.plots import post_training_curves, save, success_curves
-
     try:
+        if settings.paper:
+            print(rebuild(settings.out or Path('docs/results')))
+            return
         report = read_study(settings.study, settings.threshold)
     except ValueError as error:
         fail(str(error))
     out = settings.out or settings.study / 'report'
     out.parent.mkdir(parents=True, exist_ok=True)
     write_json(out.with_suffix('.json'), report)
+    print(_write_tables_and_figures(report, out))
+
+
+def rebuild(folder: Path) -> str:
+    """Write tables and figures of all studies in paper.yaml, and the page, which is returned.
+
+    Raises:
+        ValueError: If paper.yaml or a result that it names is missing or malformed.
+    """
+    evidence = read_evidence(folder / 'paper.yaml')
+    for name in sorted({name for artefact in evidence.artefacts for name in artefact.files}):
+        results = _read_json(folder / name) if name.endswith('.json') else {}
+        if 'adaptations' in results:
+            results['curve'] = {  # JSON has no numbers for names
+                arm: {float(fraction): point for fraction, point in points.items()}
+                for arm, points in results['curve'].items()
+            }
+            _write_tables_and_figures(results, (folder / name).with_suffix(''))
+    page = format_evidence(evidence)
+    (folder / 'paper.md').write_text(page, encoding='utf-8')
+    return page
+
+
+def _write_tables_and_figures(report: dict[str, Any], out: Path) -> str:
+    """Write OUT.md and the figures; returns the tables."""
+    from metagcttt_tools.common.plots import post_training_curves, save, success_curves
+
     text = format_report(report)
     out.with_suffix('.md').write_text(text, encoding='utf-8')
     save(success_curves(_panels(report['adaptations'])), out.with_suffix('.png'))
     if report['curve']:
         save(post_training_curves(report['curve']), out.with_name(f'{out.name}-curve.png'))
-    print(text)
+    return text
 
 
 def _panels(adaptations: dict[str, Any]) -> dict[str, Any]:

@@ -174,13 +174,17 @@ def watch_report(patch: pytest.MonkeyPatch, seen: Seen) -> None:
         return {'adaptations': {}, 'curve': {}}
 
     patch.setattr(report, 'read_study', read)
+    patch.setattr(report, 'rebuild', lambda folder: seen.append(('paper', folder)))
     patch.setattr(report, 'format_report', lambda contents: '')
     patch.setattr(plots, 'success_curves', lambda panels: None)
     patch.setattr(plots, 'save', lambda figure, path: seen.append(path))
 
 
 REPORT = Walk(
-    'report', {}, {'study': 'out/other', 'out': 'elsewhere', 'threshold': 0.5}, watch_report
+    'report',
+    {},
+    {'study': 'out/other', 'out': 'elsewhere', 'threshold': 0.5, 'paper': True},
+    watch_report,
 )
 
 WALKS = (EVALUATE, SUCCESS_CURVE, DRAW, LOSSES, STUDY, REPORT)

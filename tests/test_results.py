@@ -1,0 +1,153 @@
+"""The evidence: what paper.yaml and the pages state agrees with the results and the presets."""
+
+import json
+from pathlib import Path
+import re
+
+from metagcttt_tools import report
+from metagcttt_tools.common.differences import differences, paired_difference
+from metagcttt_tools.common.evidence import format_evidence, read_evidence
+from metagcttt_tools.common.presets import load_preset
+from metagcttt_tools.common.resume import flat
+import pytest
+import yaml
+
+from tests.tools.tables import squeezed
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / 'docs' / 'results'
+EVIDENCE = read_evidence(RESULTS / 'paper.yaml')
+WITH_RESULTS = [artefact for artefact in EVIDENCE.artefacts if artefact.files]
+DIFFERENCE = re.compile(r'[+-]\d\.\d{3} ± \d\.\d{3}')
+
+
+def read(name):
+    return json.loads((RESULTS / name).read_text())
+
+
+def test_every_artefact_of_the_paper_is_listed_once():
+    listed = [artefact.id for artefact in EVIDENCE.artefacts]
+    paper = ['T1', 'T2', 'T3', 'T4', 'F3', 'F4', 'F5', 'F6', 'F7', 'F8', 'F9', 'D', 'E']
+    assert sorted(listed) == sorted([*paper, 'B'])
+
+
+@pytest.mark.parametrize('artefact', WITH_RESULTS, ids=lambda artefact: artefact.id)
+def test_settings_are_those_of_the_preset(artefact):
+    preset = flat(load_preset(artefact.preset))
+    assert artefact.settings
+    assert {name: preset[name] for name in artefact.settings} == artefact.settings
+
+
+@pytest.mark.parametrize('artefact', WITH_RESULTS, ids=lambda artefact: artefact.id)
+def test_results_are_of_so_many_training_seeds(artefact):
+    for name in artefact.files:
+        results = read(name)
+        if 'adaptations' in results:
+            arms = [arm for arms in results['adaptations'].values() for arm in arms.values()]
+            counts = {len(arm['seeds']) for arm in arms}
+        else:
+            settings = results['settings']
+            runs = settings.get('runs') or settings.get('checkpoints') or [settings['checkpoint']]
+            counts = {len(runs)}
+        assert artefact.seeds in counts, name
+
+
+def test_results_come_from_committed_code():
+    """Those of old that do not are listed, and no others."""
+    names = {name for artefact in WITH_RESULTS for name in artefact.files}
+    names |= {path.name for path in RESULTS.glob('*-cpu.json')}
+    dirty = set()
+    for name in names:
+        results = read(name)
+        commit = results.get('commit') or results['study']['commit']
+        if commit == 'unknown' or commit.endswith('-dirty'):
+            dirty.add(name)
+    assert dirty == set(EVIDENCE.from_dirty_trees)
+
+
+@pytest.mark.parametrize('artefact', WITH_RESULTS, ids=lambda artefact: artefact.id)
+def test_differences_in_claims_are_those_of_the_results(artefact):
+    stated = [text for claim in artefact.claims for text in DIFFERENCE.findall(claim.evidence)]
+    known = set()
+    for name in artefact.files:
+        results = read(name)
+        for arms in results.get('adaptations', {}).values():
+            for arm in arms.values():
+                found, _ = differences(arms['base'], arm, results['threshold'])
+                known |= {str(difference).rstrip('*') for difference in found.values()}
+    if artefact.id == 'T2':
+        ways = read(artefact.files[0])['adaptations']
+        areas = [ways[way]['base']['auc_per_seed'] for way in ('actor-only', 'full')]
+        known.add(str(paired_difference(*areas)).rstrip('*'))
+    assert set(stated) <= known
+    assert stated or artefact.id not in ('T2', 'F3')
+
+
+def test_pages_and_tables_are_those_of_the_results(tmp_path, capsys):
+    """`metagcttt report --paper` rebuilds what is committed."""
+    for path in [*RESULTS.glob('*.json'), RESULTS / 'paper.yaml']:
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    report.main(['--paper', '--out', str(tmp_path)])
+    page = (tmp_path / 'paper.md').read_text()
+    assert page == format_evidence(EVIDENCE)
+    assert page in capsys.readouterr().out
+    assert page == (RESULTS / 'paper.md').read_text()
+    studies = sorted(path.stem for path in tmp_path.glob('*-study.md'))
+    assert len(studies) == 3
+    for name in studies:
+        assert (RESULTS / f'{name}.md').read_text() == (tmp_path / f'{name}.md').read_text()
+        assert (tmp_path / f'{name}.png').read_bytes().startswith(b'\x89PNG')
+
+
+TABLES = [
+    ('docs/results/README.md', 'pointmaze-medium-navigate-study.json', 'ttt', {
+        'base': 'base', 'continual': 'CONTINUAL-TTT', 'fomaml': 'TT-FOMAML',
+        'reptile': 'TT-REPTILE',
+    }),
+    ('docs/results/README.md', 'antmaze-medium-navigate-study.json', 'ttt', {
+        'base': 'base', 'continual': 'CONTINUAL-TTT', 'fomaml': 'TT-FOMAML',
+        'reptile': 'TT-REPTILE',
+    }),
+    ('docs/results/README.md', 'pointmaze-medium-stitch-study.json', 'full', {
+        'base': 'actor and critic',
+    }),
+    ('docs/results/README.md', 'pointmaze-medium-stitch-study.json', 'actor-only', {
+        'base': 'actor alone',
+    }),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(('document', 'name', 'adaptation', 'labels'), TABLES)
+def test_tables_of_studies_in_the_documents(document, name, adaptation, labels):
+    text = squeezed((ROOT / document).read_text())
+    arms = read(name)['adaptations'][adaptation]
+    for arm, label in labels.items():
+        summary = arms[arm]
+        points = zip(summary['success'], summary['standard_error'], strict=True)
+        cells = [f'{mean:.2f} ± {error:.2f}' for mean, error in points]
+        area = f'{summary["auc"]:.3f} ± {summary["auc_error"]:.3f}'
+        assert f'| {label} | {" | ".join(cells)} | {area} |' in text
+
+
+def test_table_of_the_small_policies_in_the_readme():
+    text = squeezed((ROOT / 'README.md').read_text())
+    results = read('pointmaze-medium-navigate-cpu.json')['results']
+    for label, result in zip(('base', 'post-trained (TT-REPTILE)'), results, strict=True):
+        cells = [f'{p["success"]:.2f} ± {p["standard_error"]:.2f}' for p in result['curve']]
+        assert f'| {label} | {" | ".join(cells)} | {result["auc"]:.3f} |' in text
+
+
+@pytest.mark.parametrize(
+    ('change', 'message'),
+    [
+        ({'verdict': 'proven'}, "verdict: Input should be 'holds', 'does not hold'"),
+        ({'proof': 'x'}, "Claim has no setting 'proof'"),
+    ],
+)
+def test_malformed_evidence_is_refused(tmp_path, change, message):
+    claim = {'claim': 'a', 'verdict': 'holds', 'evidence': 'b'} | change
+    path = tmp_path / 'paper.yaml'
+    path.write_text(yaml.safe_dump({'artefacts': [{'id': 'T1', 'claims': [claim]}]}))
+    with pytest.raises(ValueError, match=re.escape(message)) as caught:
+        read_evidence(path)
+    assert str(path) in str(caught.value)
