@@ -22,21 +22,26 @@ def environment_names() -> tuple[str, ...]:
     return tuple(name for family in FAMILIES.values() for name in family.names())
 
 
-def make_simulator(name: str) -> Simulator:
+def make_simulator(name: str, *, standing: bool = False) -> Simulator:
     """Build the simulator of a maze.
 
     Args:
         name: One of `environment_names()`, or the name of an OGBench dataset, which means the
             maze it was recorded in (`pointmaze-medium-navigate-v0` for `pointmaze-medium-v0`).
+        standing: Start the tasks of a humanoid on its feet, not as OGBench does.
 
     Returns:
         A simulator without an episode; call `reset`.
 
     Raises:
-        ValueError: If the name is unknown; names the nearest known one.
+        ValueError: If the name is unknown (names the nearest known one), or the robot has no other
+            start than a standing one.
     """
     family, canonical = _find(name)
-    return family.make(canonical)
+    simulator = family.make(canonical)
+    if standing:
+        simulator.start_standing()
+    return simulator
 
 
 def describe_environment(name: str) -> MazeDescription:

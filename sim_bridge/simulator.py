@@ -114,6 +114,14 @@ class Simulator(ABC):
             ValueError: If there is no such task or the seed is negative.
         """
 
+    def start_standing(self) -> None:
+        """Show the robot on its feet at the start and the goal of every task from now on.
+
+        Raises:
+            ValueError: If it starts its tasks on its feet anyway: only humanoids do not.
+        """
+        raise ValueError(f'{self.spec.name}: only humanoids have a standing start')
+
     @abstractmethod
     def reset_free(
         self, seed: int | None = None, start_xy: tuple[float, float] | None = None

@@ -9,8 +9,12 @@ from numpy.typing import NDArray
 from sim_bridge.controllers.humanoid import (
     com_velocity,
     head_height,
-    OBS_DIM,
     policy_inputs,
+)
+from sim_bridge.controllers.humanoid_crowd import (
+    observe,
+    physics_states,
+    set_physics_states,
 )
 from sim_bridge.controllers.humanoid_reward import walking_reward
 from sim_bridge.controllers.posture import FALLEN_HEAD_M
@@ -60,6 +64,10 @@ class Course:
     p_push: float = 0.0
     push_m_s: float = 0.5
 
+    def ground(self, rng: np.random.Generator) -> 'HumanoidGround':
+        """The humanoids, on their feet."""
+        return HumanoidGround(self, rng)
+
 
 @dataclass(frozen=True, slots=True)
 class GroundStep:
@@ -68,16 +76,16 @@ class GroundStep:
     Attributes:
         next_inputs: What the policy would see next were its direction kept, shape (n, 67).
         rewards: Shape (n,).
-        speeds: Along the directions, metres per second, shape (n,).
         fallen: The episode is over by a fall.
         cut: The next step belongs to another episode or direction, shape (n,).
+        figures: Means to log, by name.
     """
 
     next_inputs: Array
     rewards: Array
-    speeds: Array
     fallen: NDArray[np.bool_]
     cut: NDArray[np.bool_]
+    figures: dict[str, float]
 
 
 class HumanoidGround:
@@ -123,7 +131,7 @@ class HumanoidGround:
         self._steps_done += 1
         for index in range(self.course.floors, self.count):
             self._aim(index)  # at the same point, from where the humanoid is now
-        observations, quaternions = self._observe()
+        observations, quaternions = observe(self._envs)
         next_inputs = policy_inputs(observations, quaternions, self._directions())
         rewards = walking_reward(observations, next_inputs[:, _FACING], directions, actions)
         speeds = (com_velocity(observations) * directions).sum(axis=-1)
@@ -136,7 +144,8 @@ class HumanoidGround:
             else:
                 cut[index] = self._redirect(index, rng)
         self.inputs = self._look() if cut.any() else next_inputs
-        return GroundStep(next_inputs, rewards, speeds, fallen, cut)
+        figures = {'speed_m_s': speeds.mean(), 'falls_per_1000_steps': 1000 * fallen.mean()}
+        return GroundStep(next_inputs, rewards, fallen, cut, figures)
 
     def turn(self, angles: Array) -> None:
         """Change the directions of the humanoids on the floor by these angles, radians."""
@@ -145,14 +154,8 @@ class HumanoidGround:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """State of the training for a resumed run, by name."""
-        import mujoco
-
-        size = mujoco.mj_stateSize(self._envs[0].model, mujoco.mjtState.mjSTATE_INTEGRATION)
-        physics = np.empty((self.count, size))
-        for env, row in zip(self._envs, physics, strict=True):
-            mujoco.mj_getState(env.model, env.data, row, mujoco.mjtState.mjSTATE_INTEGRATION)
         return {
-            'physics': physics,
+            'physics': physics_states(self._envs),
             'angles': self._angles,
             'steps': self._steps,
             'switch_at': self._switch_at,
@@ -163,26 +166,14 @@ class HumanoidGround:
 
     def load_arrays(self, arrays: dict[str, np.ndarray]) -> None:
         """Take over what `arrays` gave."""
-        import mujoco
-
-        for env, row in zip(self._envs, arrays['physics'], strict=True):
-            mujoco.mj_setState(env.model, env.data, row, mujoco.mjtState.mjSTATE_INTEGRATION)
-            mujoco.mj_step1(env.model, env.data)  # where OGBench's step ends
+        set_physics_states(self._envs, arrays['physics'])
         for name in ('angles', 'steps', 'switch_at', 'cells', 'goals'):
             getattr(self, f'_{name}')[...] = arrays[name]
         self._steps_done = int(arrays['steps_done'])
         self.inputs = self._look()
 
     def _look(self) -> Array:
-        return policy_inputs(*self._observe(), self._directions())
-
-    def _observe(self) -> tuple[Array, Array]:
-        observations = np.empty((self.count, OBS_DIM))
-        quaternions = np.empty((self.count, 4))
-        for index, env in enumerate(self._envs):
-            observations[index] = env.get_ob()
-            quaternions[index] = env.data.qpos[3:7]
-        return observations, quaternions
+        return policy_inputs(*observe(self._envs), self._directions())
 
     def _directions(self) -> Array:
         return np.stack([np.cos(self._angles), np.sin(self._angles)], axis=-1)

@@ -94,6 +94,7 @@ class OGBenchMaze(GymMaze):
         super().__init__(describe(name))
         self._env = make_environment(name)
         self._is_humanoid = name.startswith('humanoidmaze')
+        self._standing = False
         teleports = self._env._teleport_info or {'teleport_in_xys': []}
         self._teleport_xys = teleports['teleport_in_xys']
         self._noise = np.random.RandomState(0)
@@ -105,8 +106,23 @@ class OGBenchMaze(GymMaze):
         options = {} if task_id is None else {'task_id': self._checked_task(task_id)}
         self._show_goal(True)
         observation, goal = self._reset(seed, options)
+        if self._standing:
+            start_xy = np.array(self.position)
+            self._env.set_xy(goal[:2])
+            goal = self.stand()
+            self._env.set_xy(start_xy)
+            observation = self.stand()
         self._begin(is_task=True)
         return observation, goal
+
+    def start_standing(self) -> None:
+        """Show a humanoid on its feet at starts and goals; see `Simulator.start_standing`.
+
+        Starts and goals are where OGBench's are, the turns of the torso are random.
+        """
+        if not self._is_humanoid:
+            super().start_standing()
+        self._standing = True
 
     def reset_free(
         self, seed: int | None = None, start_xy: tuple[float, float] | None = None

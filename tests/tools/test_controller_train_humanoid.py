@@ -55,6 +55,16 @@ def test_other_seed_is_another_run(trained: Path, capsys: pytest.CaptureFixture[
     assert 'cannot resume, seed was 0 and is now 5' in capsys.readouterr().err
 
 
+def test_training_to_get_up_logs_the_lift_and_leaves_a_controller(tmp_path: Path) -> None:
+    train(tmp_path, '--task', 'get-up')
+    follower = load_follower(tmp_path / 'controller')
+    assert (follower.obs_dim, follower.metadata['sweeps']) == (69, 20)
+    lines = [json.loads(line) for line in (tmp_path / 'metrics.jsonl').read_text().splitlines()]
+    assert [line['step'] for line in lines] == list(range(2, 21, 2))
+    assert {'reward_per_step', 'lift', 'stood_after_5_s'} <= lines[0].keys()
+    assert lines[0]['lift'] == 0.8
+
+
 def test_controller_makes_data_that_end_before_a_fall(trained: Path, tmp_path: Path) -> None:
     generate.main(
         [

@@ -39,6 +39,18 @@ def test_default_output_is_named_as_ogbench_names_it(capsys: pytest.CaptureFixtu
         assert label in out
 
 
+@pytest.mark.parametrize(
+    ('environment', 'name'),
+    [
+        ('antmaze-large-v0', 'antmaze-large-stitch-v0'),
+        ('humanoidmaze-medium-v0', 'humanoidmaze-medium-stitch-standing-v0'),
+    ],
+)
+def test_data_of_a_humanoid_say_how_it_starts(environment: str, name: str) -> None:
+    settings = generate.GenerateSettings(environment=environment, kind='stitch')
+    assert settings.file == Path(f'data/{name}.npz')
+
+
 def test_flags_reach_the_plan() -> None:
     generate.main(
         '--environment pointmaze-large-v0 --kind explore --seed 9 --noise 0.25 --output a/b.npz'
@@ -56,6 +68,15 @@ def test_flags_reach_the_plan() -> None:
         (
             ['--environment', 'humanoidmaze-medium-v0', '--controller', 'nowhere'],
             'nowhere: no direction controller there',
+        ),
+        (
+            [
+                '--environment',
+                'humanoidmaze-medium-v0',
+                '--output',
+                'humanoidmaze-medium-navigate-v0.npz',
+            ],
+            "humanoidmaze-medium-navigate-v0.npz: is the name of OGBench's data",
         ),
         (['--output', 'here.zip'], 'must end in .npz, got here.zip'),
         (['--kind', 'play'], 'play'),

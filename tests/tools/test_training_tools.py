@@ -246,5 +246,9 @@ def test_evaluate_table_shows_mean_error_and_auc():
         {'budget': 0, 'success': 0.25, 'standard_error': 0.0125},
         {'budget': 10, 'success': 0.875, 'standard_error': 0.05},
     ]
-    table = evaluate.format_table([{'checkpoint': 'meta', 'curve': curve, 'auc': 0.5625}])
+    results = [{'checkpoint': 'meta', 'curve': curve, 'auc': 0.5625}]
+    table = evaluate.format_table(results)
     assert squeezed(table).splitlines()[-1] == '| meta | 0.25 ± 0.01 | 0.88 ± 0.05 | 0.562 |'
+    standing = squeezed(evaluate.format_table(results, standing=True)).splitlines()
+    assert standing[0].startswith('| policy | start | K = ')
+    assert standing[-1].startswith('| meta | standing | 0.25')

@@ -1,4 +1,4 @@
-"""Train the controller that walks the humanoid along a direction, which offline data needs."""
+"""Train the controllers of the humanoid: to walk along a direction, and to get up."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -10,11 +10,13 @@ from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.resume import Resumable
 from metagcttt_tools.common.run_log import RunLog
 from metagcttt_tools.common.session import sole_writer, stop_on_signal, use_threads, write_settings
+from metagcttt_tools.controller.recipe import HumanoidTask, STAGES_OF
 
-_DESCRIPTION = """Train the controller that walks the humanoid along a direction (SAC).
+_DESCRIPTION = """Train a controller of the humanoid (SAC): to walk along a direction or to get up.
 
 Example: metagcttt controller train-humanoid --out out/humanoid-controller
-Three stages: to walk on a floor, to bear noise and pushes, to walk in mazes.
+Three stages to walk: on a floor, with noise and pushes, in mazes. To get up, the humanoids are
+dropped as OGBench drops them, and lifted by a force that fades as they succeed.
 Writes OUT/controller, OUT/checkpoint.safetensors (replay buffer included) and logs.
 Ctrl-C saves and ends; --resume, with no other flag than --out, continues."""
 
@@ -25,6 +27,7 @@ class TrainHumanoidSettings(Resumable):
     may_change = frozenset({'checkpoint_every', 'log_every', 'threads'})
 
     out: Path = Field(Path('out/humanoid-controller'), description='folder of the run')
+    task: HumanoidTask = Field('walk', description='what to learn')
     length: float = Field(1.0, gt=0, description='of each stage, as a share of the usual length')
     seed: int = Field(0, ge=0, description='random seed')
     checkpoint_every: int = Field(2500, ge=1, description='sweeps between checkpoints')
@@ -45,10 +48,10 @@ def main(argv: list[str] | None = None) -> None:
 
 def _run(settings: TrainHumanoidSettings) -> None:
     from metagcttt_tools.controller.humanoid import HumanoidTraining
-    from metagcttt_tools.controller.recipe import STAGES
 
     stages = tuple(
-        replace(stage, sweeps=max(1, round(settings.length * stage.sweeps))) for stage in STAGES
+        replace(stage, sweeps=max(1, round(settings.length * stage.sweeps)))
+        for stage in STAGES_OF[settings.task]
     )
     training = HumanoidTraining(settings.out, settings.seed, stages)
     if training.checkpoint.exists():

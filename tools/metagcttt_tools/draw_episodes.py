@@ -14,7 +14,7 @@ from sim_bridge import make_simulator
 from tqdm import tqdm
 
 from metagcttt_tools.common.cli import fail, parse
-from metagcttt_tools.common.results import markdown_table, write_report
+from metagcttt_tools.common.results import markdown_table, start_column, write_report
 from metagcttt_tools.common.session import use_threads
 
 if TYPE_CHECKING:
@@ -38,6 +38,9 @@ class DrawSettings(Settings):
     )
     ttt: TTTSettings = Field(TTTSettings(), description='test-time training')
     filter: FilterConfig = FilterConfig(variant='gcttt')
+    standing: bool = Field(
+        False, description='start humanoids on their feet, not fallen as OGBench does'
+    )
     seed: int = Field(0, ge=0, description='random seed of starts, goals and adaptations')
     out: Path = Field(Path('out/episodes'), description='files to write, without suffix')
 
@@ -61,7 +64,8 @@ def _run(settings: DrawSettings) -> None:
     agent = load_checkpoint(settings.checkpoint)
     dataset = TrajectoryDataset.load(settings.dataset)
     trajectory_filter = TrajectoryFilter(dataset, settings.filter)
-    with make_simulator(str(agent.metadata['environment'])) as simulator:
+    environment = str(agent.metadata['environment'])
+    with make_simulator(environment, standing=settings.standing) as simulator:
         tasks = [task.task_id for task in simulator.tasks]
         goals = [simulator.reset(task, settings.seed)[1] for task in tasks]
         arms: dict[str, list[Episode]] = {}
@@ -89,7 +93,11 @@ def _run(settings: DrawSettings) -> None:
             segments=[retrieved(episode, dataset, (x, y)) for episode in episodes],
             goals=[(goal[x], goal[y]) for goal in goals],
         )
-    rows = [summarize(arm, episode) for arm, episodes in arms.items() for episode in episodes]
+    rows = [
+        {**start_column(settings.standing), **summarize(arm, episode)}
+        for arm, episodes in arms.items()
+        for episode in episodes
+    ]
     save(figure, settings.out.with_suffix('.png'))
     write_report(settings.out.with_suffix('.json'), settings, {'episodes': rows})
     print(markdown_table(rows))

@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.job_log import JobLog
-from metagcttt_tools.common.results import markdown_table
+from metagcttt_tools.common.results import markdown_table, start_column
 from metagcttt_tools.common.resume import Resumable
 from metagcttt_tools.common.session import provenance, sole_writer, use_threads
 
@@ -53,6 +53,9 @@ class EpisodeSettings(Settings):
     filter: FilterConfig = FilterConfig()
     episodes: int = Field(10, ge=1, description='episodes per task and seed')
     seeds: tuple[int, ...] = Field((0, 1, 2), min_length=1, description='evaluation seeds')
+    standing: bool = Field(
+        False, description='start humanoids on their feet, not fallen as OGBench does'
+    )
 
 
 class ProtocolSettings(Resumable, EpisodeSettings):
@@ -94,7 +97,7 @@ def main(argv: list[str] | None = None) -> None:
         raise SystemExit(130) from None
     report = {'settings': settings.model_dump(mode='json'), **provenance(), 'results': results}
     write_json(settings.out, report)
-    print(format_table(results))
+    print(format_table(results, settings.standing))
     print(f'results: {settings.out}')
 
 
@@ -106,7 +109,7 @@ def evaluate(settings: EvaluateSettings, program: Resumable) -> list[dict[str, A
         program: The settings to continue with after an interruption.
     """
     environments = [environment_of(path) for path in settings.checkpoints]
-    num_tasks = make_simulator(environments[0]).spec.num_tasks
+    num_tasks = make_simulator(environments[0], standing=settings.standing).spec.num_tasks
     jobs = [
         (str(path), environment, budget, seed, task)
         for path, environment in zip(settings.checkpoints, environments, strict=True)
@@ -150,12 +153,13 @@ def success_curve(checkpoint: Path, curve: list[dict[str, Any]]) -> dict[str, An
     return {'checkpoint': str(checkpoint), 'curve': curve, 'auc': auc}
 
 
-def format_table(results: list[dict[str, Any]]) -> str:
+def format_table(results: list[dict[str, Any]], standing: bool = False) -> str:
     """Success by budget as a Markdown table."""
     return markdown_table(
         [
             {
                 'policy': result['checkpoint'],
+                **start_column(standing),
                 **{
                     f'K = {point["budget"]}': f'{point["success"]:.2f} ± '
                     f'{point["standard_error"]:.2f}'
@@ -249,7 +253,7 @@ def _success_rate(job: Job) -> float:
     policy = load_checkpoint(path, environment=environment, changes=changes)
     if policy.fingerprint() != _Worker.fingerprints[path]:
         raise CheckpointError(f'{path}: was replaced while it was evaluated')
-    simulator = make_simulator(environment)
+    simulator = make_simulator(environment, standing=_Worker.settings.standing)
     result = evaluate_success(
         policy,
         simulator,

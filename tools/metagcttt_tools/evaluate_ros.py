@@ -96,7 +96,7 @@ def main(argv: list[str] | None = None) -> None:
         raise SystemExit(130) from None
     report = {'settings': settings.model_dump(mode='json'), **provenance(), 'results': results}
     write_json(settings.out, report)
-    print(format_table(results))
+    print(format_table(results, settings.standing))
     print('median adaptation, filter and inner loop (ms):')
     for result in results:
         times = ', '.join(
@@ -124,7 +124,7 @@ def evaluate_ros(settings: EvaluateRosSettings) -> list[dict[str, Any]]:
     if len(environments) > 1:
         raise ValueError(f'checkpoints for one environment at a time, got {sorted(environments)}')
     environment = environments.pop()
-    with make_simulator(environment) as simulator:
+    with make_simulator(environment, standing=settings.standing) as simulator:
         tasks = [task.task_id for task in simulator.tasks]
     episodes = [
         (seed, task, number)
@@ -150,7 +150,7 @@ def evaluate_ros(settings: EvaluateRosSettings) -> list[dict[str, Any]]:
             for seed, task, number in episodes
         ],
         logs=settings.out.parent / 'logs',
-        simulator=world,
+        simulator={**world, 'standing': settings.standing},
         goal_node={**world, 'dataset': str(settings.dataset)},
     )
     return [

@@ -38,7 +38,8 @@ writes data/pointmaze-medium-navigate-v0.npz, ...-val.npz (a tenth as many episo
 ...-v0.json (settings, versions, statistics) and ...-v0.png (where the robot has been).
 
 Ant and humanoid walk by the controllers in sim_bridge/controllers/weights; --controller takes
-another. The humanoid starts on its feet, and its episodes end a second before a fall.
+another. The humanoid starts on its feet, and its episodes end a second before a fall; its data are
+named MAZE-KIND-standing-v0.
 Where there is a network, metagcttt download fetches OGBench's published files instead."""
 
 
@@ -65,7 +66,9 @@ class GenerateSettings(Resumable):
     )
     seed: int = Field(0, ge=0, description='Random seed.')
     output: Path | None = Field(
-        None, description='Path ending in .npz; data/MAZE-KIND-v0.npz by default.'
+        None,
+        description='Path ending in .npz; by default data/MAZE-KIND-v0.npz, for a humanoid '
+        'data/MAZE-KIND-standing-v0.npz.',
     )
     processes: int = Field(
         default_factory=lambda: len(os.sched_getaffinity(0)),
@@ -79,9 +82,23 @@ class GenerateSettings(Resumable):
 
     @property
     def file(self) -> Path:
-        """The dataset to write, by default named as OGBench names it."""
+        """The dataset to write, by default named as OGBench names it.
+
+        A humanoid's is named otherwise, as its episodes do not start as OGBench's do.
+
+        Raises:
+            ValueError: If a humanoid's is to have the name of one of OGBench's.
+        """
         maze = describe_environment(self.environment).spec.name.removesuffix('-v0')
-        return self.output or Path('data') / f'{maze}-{self.kind}-v0.npz'
+        name = f'{maze}-{self.kind}-v0'
+        if maze.startswith('humanoidmaze'):
+            if self.output and self.output.stem == name:
+                raise ValueError(
+                    f"{self.output}: is the name of OGBench's data, whose humanoid starts fallen "
+                    'and gets up; choose another for data that start standing'
+                )
+            name = f'{maze}-{self.kind}-standing-v0'
+        return self.output or Path('data') / f'{name}.npz'
 
     def kept(self) -> tuple[Path, Mapping[str, Any]] | None:
         """The settings of the dataset that is in progress or complete."""

@@ -12,9 +12,13 @@ import numpy as np
 from pydantic import Field
 
 from metagcttt_tools.common.cli import fail, parse
-from metagcttt_tools.common.results import markdown_table, write_report
+from metagcttt_tools.common.results import markdown_table, start_column, write_report
 from metagcttt_tools.common.session import snapshot_folder, SNAPSHOTS, sole_writer
-from metagcttt_tools.evaluate import evaluate, EvaluateSettings, ProtocolSettings
+from metagcttt_tools.evaluate import (
+    evaluate,
+    EvaluateSettings,
+    ProtocolSettings,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -59,7 +63,7 @@ def main(argv: list[str] | None = None) -> None:
     except KeyboardInterrupt:
         print('interrupted; pass --resume to continue', file=sys.stderr)
         raise SystemExit(130) from None
-    rows = curve_rows(results, steps)
+    rows = [{**row, **start_column(settings.standing)} for row in curve_rows(results, steps)]
     write_report(settings.out, settings, {'curve': rows})
     picture = settings.out.with_suffix('.png')
     save(curve_picture(rows), picture)

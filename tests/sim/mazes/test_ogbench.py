@@ -204,6 +204,32 @@ def test_humanoid_starts_free_episodes_on_its_feet_and_tasks_as_in_ogbench() -> 
         assert before[36:39].tolist() != pytest.approx([0, 0, 1], abs=0.01)
 
 
+def test_humanoid_that_starts_standing_has_ogbenchs_places() -> None:
+    with (
+        make_simulator('humanoidmaze-medium-v0') as fallen,
+        make_simulator('humanoidmaze-medium-v0', standing=True) as standing,
+    ):
+        for seed in (3, 4):
+            theirs, ours = (maze.reset(task_id=2, seed=seed) for maze in (fallen, standing))
+            for lying, upright in zip(theirs, ours, strict=True):
+                assert upright[:2].tolist() == lying[:2].tolist()
+                assert upright[23] == pytest.approx(1.49)
+                np.testing.assert_allclose(upright[36:39], [0, 0, 1], atol=1e-9)
+                assert not upright[39:].any()  # at rest
+            assert (theirs[0][2:23] != ours[0][2:23]).all()
+        np.testing.assert_array_equal(standing.reset(task_id=2, seed=4), ours)
+        assert standing.position == tuple(ours[0][:2])
+        assert not standing.step(np.zeros(21)).success
+        standing.environment.set_xy(ours[1][:2])
+        assert standing.step(np.zeros(21)).success
+
+
+def test_only_humanoids_have_a_standing_start() -> None:
+    for name in ('antmaze-medium-v0', 'PointMaze_UMaze-v3'):
+        with pytest.raises(ValueError, match=f'{name}: only humanoids have a standing start'):
+            make_simulator(name, standing=True)
+
+
 def test_standing_robots_are_left_as_they_are() -> None:
     with OGBenchMaze('antmaze-medium-v0') as ant:
         observation, _ = ant.reset(task_id=1, seed=0)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from safetensors.torch import load_file
 from sim_bridge.controllers.humanoid import mirror_action, mirror_inputs
+from sim_bridge.controllers.humanoid_get_up import GetUpCourse
 from sim_bridge.controllers.humanoid_ground import Course
 import torch
 
@@ -77,6 +78,22 @@ def test_run_stopped_in_each_stage_and_resumed_ends_with_the_same_bits(tmp_path:
     for name, tensor in whole.items():
         assert torch.equal(tensor, parts[name]), name
     assert not torch.equal(whole['actor.weights.0'], whole['average.0'])
+
+
+@pytest.mark.mujoco
+def test_get_up_run_stopped_and_resumed_ends_with_the_same_bits(tmp_path: Path) -> None:
+    stages = (Stage('get-up', GetUpCourse(floors=4), 40, (1, 0.2)),)
+    assert training(tmp_path / 'whole', stages).run(forget)
+    part = training(tmp_path / 'parts', stages)
+    assert not part.run(forget, should_stop=lambda: part.sweep == 17)
+    last = training(tmp_path / 'parts', stages)
+    last.restore()
+    assert last.run(forget)
+    whole, parts = (
+        load_file(tmp_path / name / 'checkpoint.safetensors') for name in ('whole', 'parts')
+    )
+    for name, tensor in whole.items():
+        assert torch.equal(tensor, parts[name]), name
 
 
 @pytest.mark.mujoco

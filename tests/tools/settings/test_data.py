@@ -303,6 +303,7 @@ HUMANOID = Walk(
     {
         'resume': Proof(True, again=True),
         'out': 'elsewhere',
+        'task': 'get-up',
         'length': 0.5,
         'seed': 1,
         'checkpoint_every': 3,

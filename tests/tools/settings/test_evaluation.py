@@ -61,6 +61,7 @@ EVALUATION = {
     'budgets': [1],
     'episodes': 2,
     'seeds': [5],
+    'standing': True,
     'processes': 3,
 }
 EVALUATE = Walk(
@@ -106,6 +107,7 @@ DRAW = Walk(
         'checkpoint': '@other',
         'dataset': '@half.npz',
         'budgets': [1],
+        'standing': True,
         'seed': 1,
         'out': 'elsewhere',
         **under('ttt', TTT, actor_only={'checkpoint': '@gciql'}),

@@ -52,6 +52,7 @@ EVALUATE_ROS = Walk(
         'budgets': [1],
         'episodes': 2,
         'seeds': [5],
+        'standing': Proof(True, refused='only humanoids have a standing start'),
         'timeout_s': 7.0,
         'out': 'elsewhere/evaluation.json',
         'ttt.lr': 0.1,

@@ -233,8 +233,9 @@ def _repeatable(value: Any) -> Any:
 class ShortSimulator:
     """The tasks of a maze, in which whatever moves does so for four steps."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, *, standing: bool = False) -> None:
         description = describe_environment(name)
+        self._lowest_m = 5 + standing  # where starts and goals are drawn
         self.spec, self.maze, self.tasks = description.spec, description.maze, description.tasks
 
     def __enter__(self) -> 'ShortSimulator':
@@ -248,8 +249,8 @@ class ShortSimulator:
 
     def reset(self, task_id: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
         rng = np.random.default_rng((task_id, seed))
-        self._steps, self._at = 0, rng.uniform(5, 15, 2)
-        return self._at, rng.uniform(5, 15, 2)
+        self._steps, self._at = 0, rng.uniform(self._lowest_m, 15, 2)
+        return self._at, rng.uniform(self._lowest_m, 15, 2)
 
     def step(self, action: np.ndarray) -> Any:
         self._steps, self._at = self._steps + 1, self._at + action

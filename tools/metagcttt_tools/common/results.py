@@ -33,6 +33,11 @@ def markdown_table(rows: list[dict[str, Any]]) -> str:
     return tabulate(cells, headers='keys', tablefmt='github', disable_numparse=True)
 
 
+def start_column(standing: bool) -> dict[str, str]:
+    """The column of a table that names a start which is not OGBench's; else none."""
+    return {'start': 'standing'} if standing else {}
+
+
 def write_report(path: Path, settings: Settings, results: dict[str, Any]) -> None:
     """Results as JSON, with settings, commit, versions and machine."""
     report = {

@@ -18,7 +18,6 @@ from sim_bridge.controllers.humanoid import (
     INPUT_SOURCES,
     MOTORS,
 )
-from sim_bridge.controllers.humanoid_ground import HumanoidGround
 import torch
 from torch import Tensor
 
@@ -143,15 +142,14 @@ class HumanoidTraining:
     def _enter(self) -> None:
         """Begin the stage of the next sweep with new humanoids and nothing to learn from."""
         self._entered = self._stage_index()
-        course = self.stage.course
         rng = np.random.default_rng((self.seed, self._entered, self.total))
-        self._ground = HumanoidGround(course, rng)
+        self._ground = self.stage.course.ground(rng)
         dims = INPUT_DIM, len(MOTORS)
         self._replay = ReplayBuffer(REPLAY_SIZE, *dims)
         self._returns = Returns(RETURN_STEPS, self._ground.count, *dims, SAC_CONFIG.discount)
 
-    def _sweep(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Tensor]]:
-        """Step all humanoids once and learn; returns rewards, speeds, falls and losses."""
+    def _sweep(self) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Step all humanoids once and learn; returns figures and losses."""
         rng = np.random.default_rng((self.seed, self.sweep))
         ground, replay = self._ground, self._replay
         inputs = ground.inputs
@@ -170,7 +168,7 @@ class HumanoidTraining:
         self.sweep += 1
         if self._stage_index() != self._entered:
             self._enter()
-        return step.rewards, step.speeds, step.fallen, losses
+        return {'reward_per_step': step.rewards.mean(), **step.figures}, losses
 
     @torch.no_grad()
     def _average(self) -> None:
@@ -235,31 +233,18 @@ class _Meters:
         self._clear()
 
     def _clear(self) -> None:
-        self._rewards: list[float] = []
-        self._speeds: list[float] = []
-        self._falls = 0
-        self._steps = 0
+        self._figures: list[dict[str, float]] = []
         self._losses: dict[str, Tensor] = {}
 
-    def add(
-        self,
-        rewards: np.ndarray,
-        speeds: np.ndarray,
-        fallen: np.ndarray,
-        losses: dict[str, Tensor],
-    ) -> None:
-        self._rewards.append(float(rewards.mean()))
-        self._speeds.append(float(speeds.mean()))
-        self._falls += int(fallen.sum())
-        self._steps += len(fallen)
+    def add(self, figures: dict[str, float], losses: dict[str, Tensor]) -> None:
+        self._figures.append(figures)
         self._losses = losses
 
     def read(self) -> dict[str, float]:
         """Scalars of the stretch, which ends here."""
         scalars = {
-            'reward_per_step': float(np.mean(self._rewards)),
-            'speed_m_s': float(np.mean(self._speeds)),
-            'falls_per_1000_steps': 1000 * self._falls / self._steps,
+            name: float(np.mean([figures[name] for figures in self._figures]))
+            for name in self._figures[0]
         }
         scalars |= {name: float(value) for name, value in self._losses.items()}
         self._clear()

@@ -1,8 +1,10 @@
-"""Hyper-parameters of the humanoid controller."""
+"""Hyper-parameters of the humanoid's controllers."""
 
 from dataclasses import dataclass
 import math
+from typing import Literal
 
+from sim_bridge.controllers.humanoid_get_up import GetUpCourse
 from sim_bridge.controllers.humanoid_ground import Course
 
 from metagcttt_tools.controller.config import SACConfig
@@ -37,7 +39,7 @@ class Stage:
     """
 
     name: str
-    course: Course
+    course: Course | GetUpCourse
     sweeps: int
     lr: tuple[float, float]
 
@@ -57,3 +59,9 @@ STAGES = (
         (0.8, 0.15),
     ),
 )
+
+HumanoidTask = Literal['walk', 'get-up']
+STAGES_OF: dict[HumanoidTask, tuple[Stage, ...]] = {
+    'walk': STAGES,
+    'get-up': (Stage('get-up', GetUpCourse(floors=48), 100_000, (1, 0.2)),),
+}

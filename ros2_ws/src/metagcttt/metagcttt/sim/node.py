@@ -67,12 +67,14 @@ class SimBridgeNode(Node):
             kwargs: For `rclpy.node.Node`.
 
         Raises:
-            ValueError: If the environment is unknown.
+            ValueError: If the environment is unknown, or its robot has no standing start.
         """
         super().__init__('sim_bridge_node', **kwargs)
         self._settings = ParameterSet(self, SIM_BRIDGE_NODE, is_configured=lambda: True)
         self._monitor = SimMonitor()
-        self._simulator = make_simulator(self._settings['environment'])
+        self._simulator = make_simulator(
+            self._settings['environment'], standing=self._settings['standing']
+        )
         spec = self._simulator.spec
         self._lockstep = self._settings['stepping'] == 'lockstep'
         self._period_ns = round(spec.control_period_s * 1e9)
