@@ -3,7 +3,13 @@
 from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
-from metagcttt_core.robot.contract import CommandTopic, Contract, Numbers, ObservedTopic
+from metagcttt_core.robot.contract import (
+    CommandTopic,
+    CommandValue,
+    Contract,
+    Numbers,
+    ObservedTopic,
+)
 
 _NUMBERS = frozenset(
     ['float', 'double', 'float32', 'float64']
@@ -80,6 +86,8 @@ def _unsuitable(value: Numbers, found: FieldType) -> str:
         return '' if is_rotation else f'a heading is read of a quaternion, this is {found.name}'
     if found.name not in _NUMBERS:
         return f'{found.name} is no number'
+    if isinstance(value, CommandValue) and 'int' in found.name:
+        return f'commands are floating-point numbers, this is {found.name}'
     if found.is_array and not value.joints and value.size is None:
         return 'an array takes joints or size'
     if not found.is_array and (value.joints or value.size is not None):

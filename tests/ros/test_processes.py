@@ -15,7 +15,11 @@ import pytest
 from tests.ros.graph import ANY, goal_pose, Graph, Record
 
 EXECUTABLES = Path(get_package_prefix('metagcttt')) / 'lib' / 'metagcttt'
-NODES = ('goal_node', 'policy_node', 'recorder_node', 'sim_bridge_node', 'visualization_node')
+NODES = (
+    *('goal_node', 'policy_node', 'recorder_node', 'robot_bridge_node', 'sim_bridge_node'),
+    'visualization_node',
+)
+CONTRACT = Path(__file__).parents[2] / 'config' / 'robots' / 'turtlebot3.yaml'
 
 
 @pytest.fixture(autouse=True)
@@ -52,7 +56,12 @@ def start(ros_domain: int) -> Iterator[Callable[..., subprocess.Popen]]:
 
 def arguments(node: str, checkpoint: Path, dataset: Path) -> list[str]:
     both = [f'dataset:={dataset}', f'checkpoint:={checkpoint}']
-    given = {'goal_node': both[:1], 'policy_node': both, 'visualization_node': both}.get(node, [])
+    given = {
+        'goal_node': both[:1],
+        'policy_node': both,
+        'robot_bridge_node': [f'contract:={CONTRACT}'],
+        'visualization_node': both,
+    }.get(node, [])
     return [word for parameter in given for word in ('-p', parameter)]
 
 

@@ -30,6 +30,7 @@ setup(
                 'goal_node',
                 'policy_node',
                 'recorder_node',
+                'robot_bridge_node',
                 'sim_bridge_node',
                 'visualization_node',
             )

@@ -82,6 +82,13 @@ def test_rows_without_a_command_are_left_out(contract_file, tmp_path):
     assert x[-1] == pytest.approx(0.05 * 15)  # the last command held for its time-out
 
 
+def test_command_at_the_time_of_an_observation_is_not_its_answer(contract_file, tmp_path):
+    """It was under way before; the one within the period that follows is."""
+    messages = [(t, m, n - 2 * 10**7 if t == '/cmd_vel' else n) for t, m, n in drive(10)]
+    actions = convert(contract_file, write(tmp_path / 'bag', messages)).actions[:-1]
+    np.testing.assert_allclose(actions[:, 1], (0.1 * np.arange(1, 10) - 1) / 2, atol=1e-6)
+
+
 def test_joints_are_mapped_by_name(tmp_path):
     file = tmp_path / 'arm.yaml'
     file.write_text(ARM)

@@ -56,6 +56,15 @@ def recorder_node(stop: threading.Event) -> int:
 
 
 @_executable
+def robot_bridge_node(stop: threading.Event) -> int:
+    """Run the bridge to a robot until Ctrl-C or SIGTERM; returns the exit code."""
+    from metagcttt.robot.node import RobotBridgeNode
+    from metagcttt.running import run
+
+    return run(RobotBridgeNode, stop, farewell=RobotBridgeNode.end_service)
+
+
+@_executable
 def sim_bridge_node(stop: threading.Event) -> int:
     """Run the simulator bridge until Ctrl-C or SIGTERM; returns the exit code."""
     from metagcttt.running import run

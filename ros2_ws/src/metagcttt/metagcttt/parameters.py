@@ -242,6 +242,11 @@ RECORDER_NODE = (
     ),
 )
 
+ROBOT_BRIDGE_NODE = (
+    Parameter('contract', 'robot.yaml', "the robot's contract (YAML); config/robots has some"),
+    DIAGNOSTICS_PERIOD_S,
+)
+
 VISUALIZATION_NODE = (
     ENVIRONMENT,
     DATASET,
@@ -267,6 +272,7 @@ TABLES = {
     'goal_node': GOAL_NODE,
     'policy_node': POLICY_NODE,
     'recorder_node': RECORDER_NODE,
+    'robot_bridge_node': ROBOT_BRIDGE_NODE,
     'sim_bridge_node': SIM_BRIDGE_NODE,
     'visualization_node': VISUALIZATION_NODE,
 }

@@ -1,0 +1,1 @@
+"""The bridge to a robot that speaks standard messages, by its contract."""

@@ -1,0 +1,125 @@
+"""Decisions about a robot's commands: the policy's action, or what the contract falls back on."""
+
+from dataclasses import dataclass
+
+from metagcttt_core.robot import Contract
+from metagcttt_core.robot.commands import Commander, split_action
+from metagcttt_core.robot.contract import CommandTopic
+import numpy as np
+from numpy.typing import NDArray
+
+from metagcttt.input_checks import vector_fault
+
+REMEMBERED_STEPS = 1000
+
+
+@dataclass(frozen=True)
+class _Action:
+    values: NDArray[np.float64]
+    query_id: int
+    observed_ns: int
+    observation: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Situation:
+    """Why a topic does not get the policy's command.
+
+    Attributes:
+        case: A case of the contract's `fallback`; empty when the policy commands.
+        reason: The same in words.
+    """
+
+    case: str = ''
+    reason: str = ''
+
+
+class Pilot:
+    """Turns actions into commands that are within limits, in reach and never too old.
+
+    All times are nanoseconds of one monotonic clock.
+
+    Attributes:
+        stopped: Why the robot is stopped, until it is cleared; empty when it is not.
+        fault: Why there must be no command now, such as a late topic; set by the owner.
+    """
+
+    def __init__(self, contract: Contract) -> None:
+        """Start without an action."""
+        self._contract = contract
+        self._commanders = [Commander(contract, topic) for topic in contract.act]
+        self._sent_ns = [-contract.period_ns] * len(contract.act)
+        self._steps: dict[int, tuple[int, NDArray[np.float64]]] = {}
+        self._action: _Action | None = None
+        self.stopped = ''
+        self.fault = ''
+
+    def saw_observation(self, step: int, observation: NDArray[np.float64], now_ns: int) -> None:
+        """Remember when an observation was made, which limits the age of its action."""
+        self._steps[step] = (now_ns, observation)
+        self._steps.pop(step - REMEMBERED_STEPS, None)
+
+    def take_action(self, step: int, query_id: int, values: NDArray[np.float64]) -> str:
+        """Take in the action for the observation of `step`; returns why it is refused, or ''."""
+        if fault := vector_fault('the action', values, self._contract.act_dim):
+            return fault
+        if step not in self._steps:
+            return f'the action answers step {step}, which was not observed lately'
+        observed_ns, observation = self._steps[step]
+        if self._action is not None and observed_ns < self._action.observed_ns:
+            return f'the action for step {step} came after that for a newer one'
+        self._action = _Action(values, query_id, observed_ns, observation)
+        return ''
+
+    def situation(self, topic: CommandTopic, now_ns: int) -> Situation:
+        """The reason to fall back, or none."""
+        action = self._action
+        if self.stopped:
+            return Situation('stop', self.stopped)
+        if self.fault:
+            return Situation('fault', self.fault)
+        if action is None:
+            return Situation('silent', 'no action yet')
+        age_s = (now_ns - action.observed_ns) / 1e9
+        if age_s > topic.timeout_s:
+            return Situation('silent', f'the newest action is for {age_s:.2f} s ago')
+        if not action.query_id:
+            return Situation('no_goal', 'no goal')
+        # The policy sends zeros when the robot must not move; zero may be a motion here.
+        if not action.values.any():
+            return Situation('silent', 'the policy keeps the robot still')
+        return Situation()
+
+    def commands(self, now_ns: int, *, due: bool) -> list[tuple[int, NDArray[np.float64]]]:
+        """The commands to send now, each with the number of its topic in the contract.
+
+        Args:
+            now_ns: The time.
+            due: Only those that are due, because the last one is a period old: the next action is
+                under way, and a repetition before it would be taken for its answer.
+        """
+        found = []
+        for number, (topic, commander) in enumerate(
+            zip(self._contract.act, self._commanders, strict=True)
+        ):
+            if due and now_ns - self._sent_ns[number] < self._contract.period_ns:
+                continue
+            case = self.situation(topic, now_ns).case
+            if case:
+                command = commander.fall_back(getattr(topic.fallback, case), now_ns)
+            else:
+                assert self._action is not None
+                part = split_action(self._contract, self._action.values)[number]
+                command = commander.command(part, self._action.observation, now_ns)
+            if command is not None:
+                self._sent_ns[number] = now_ns
+                found.append((number, command))
+        return found
+
+    def farewell(self, now_ns: int) -> list[tuple[int, NDArray[np.float64]]]:
+        """The last commands, as the contract says for the end of the bridge."""
+        last = [
+            commander.fall_back(topic.fallback.shutdown, now_ns)
+            for topic, commander in zip(self._contract.act, self._commanders, strict=True)
+        ]
+        return [(number, command) for number, command in enumerate(last) if command is not None]
