@@ -1,6 +1,8 @@
 from collections.abc import Callable
 from pathlib import Path
+from time import monotonic
 
+from geometry_msgs.msg import PoseStamped
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from metagcttt.recorder.node import RecorderNode
@@ -19,7 +21,7 @@ from metagcttt_tools.recordings.trajectories import STATE
 import numpy as np
 import pytest
 from std_msgs.msg import Float64, String
-from tests.ros.graph import ANY, EVERY, Graph, Record
+from tests.ros.graph import ANY, EVERY, goal_pose, Graph, Record
 from tests.ros.test_lockstep_episode import drive, offline_episode, TTT
 
 
@@ -127,6 +129,23 @@ def test_recorder_takes_on_the_quality_of_the_publishers(graph: Graph, tmp_path:
     graph.wait(lambda: recorder._recording.num_messages == 2, 'the second message')
     graph.remove(recorder)
     assert [message.data for message in contents(output)['/number']] == [1.0, 2.0]
+
+
+def test_recorder_is_never_the_first_to_hear_a_goal(graph: Graph, tmp_path: Path) -> None:
+    output = tmp_path / 'run.mcap'
+    recorder = graph.add(RecorderNode, output=str(output))
+    for number in range(2):  # the second time, a subscription might be left from the first
+        begin = monotonic()
+        publisher = graph.node.create_publisher(PoseStamped, 'goal_pose', 1)
+        graph.wait(publisher.get_subscription_count, 'the recorder')
+        assert monotonic() - begin > 0.9
+        publisher.publish(goal_pose(1.0, float(number)))
+        graph.wait(lambda n=number: recorder._recording.num_messages == n + 1, 'the goal')
+        graph.node.destroy_publisher(publisher)
+        graph.wait(lambda: graph.node.count_subscribers('goal_pose') == 0, 'its leave')
+    graph.remove(recorder)
+    recorded = contents(output)['/goal_pose']
+    assert [message.pose.position.y for message in recorded] == [0.0, 1.0]
 
 
 def test_recorder_in_a_namespace_leaves_other_robots_out(graph: Graph, tmp_path: Path) -> None:

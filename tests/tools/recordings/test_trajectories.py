@@ -8,12 +8,25 @@ from metagcttt_tools.recordings.trajectories import ACTION, join_datasets, read_
 import numpy as np
 import pytest
 
-STATE_TEXT = 'uint32 episode_id\nuint32 step\nfloat64[] observation\n'
-ACTION_TEXT = 'uint32 episode_id\nuint32 step\nuint32 query_id\nfloat64[] values\n'
+STATE_TEXT = (
+    'std_msgs/Header header\nuint32 episode_id\nuint32 step\nfloat64[] observation\n'
+    + '=' * 80
+    + '\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n'
+    + '=' * 80
+    + '\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n'
+)
+ACTION_TEXT = (
+    'uint32 episode_id\nuint32 step\nuint32 query_id\nfloat64[] values\nuint64 instance\n'
+)
 
 
 class Bag:
-    """Writes states and actions, each published a millisecond after the last."""
+    """Writes states and actions, each published a millisecond after the last.
+
+    Attributes:
+        clock_ns: Time by the recorder's clock, to be changed at will.
+        ahead_ns: What the publishers' clock is ahead of that.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -21,19 +34,24 @@ class Bag:
         self._writer = Writer(self._file)
         self._state = self._writer.register_msgdef(STATE, STATE_TEXT)
         self._action = self._writer.register_msgdef(ACTION, ACTION_TEXT)
-        self._time = 0
+        self.clock_ns = 10**12
+        self.ahead_ns = 0
 
     def _write(self, topic, schema, message) -> None:
-        self._time += 10**6
-        self._writer.write_message(topic, schema, message, self._time, self._time)
+        self.clock_ns += 10**6
+        published_ns = self.clock_ns + self.ahead_ns
+        self._writer.write_message(topic, schema, message, self.clock_ns, published_ns)
 
-    def state(self, step, observation=None, *, episode=1, robot='') -> None:
+    def state(self, step, observation=None, *, episode=1, robot='', stamp_s=None) -> None:
         values = [float(step), 10.0 * episode] if observation is None else observation
-        message = {'episode_id': episode, 'step': step, 'observation': values}
+        stamp_ns = round(1e9 * (0.1 * step if stamp_s is None else stamp_s))
+        stamp = dict(zip(('sec', 'nanosec'), divmod(stamp_ns, 10**9), strict=True))
+        message = {'header': {'stamp': stamp, 'frame_id': 'map'}, 'episode_id': episode}
+        message |= {'step': step, 'observation': values}
         self._write(f'{robot}/state', self._state, message)
 
-    def action(self, step, values=None, *, episode=1, query=1, robot='') -> None:
-        message = {'episode_id': episode, 'step': step, 'query_id': query}
+    def action(self, step, values=None, *, episode=1, query=1, robot='', instance=7) -> None:
+        message = {'episode_id': episode, 'step': step, 'query_id': query, 'instance': instance}
         message['values'] = [step / 10, 0.5] if values is None else values
         self._write(f'{robot}/action', self._action, message)
 
@@ -105,6 +123,98 @@ def test_trajectory_is_cut_and_counted(bag, spoil, reason: str) -> None:
     if reason != 'idle steps':
         with pytest.raises(DatasetError, match=f'/: {reason} after step . of episode 1'):
             read_recordings([path], refuse_gaps=True)
+
+
+def test_trajectory_is_cut_where_a_clock_jumps(bag) -> None:
+    bag.walk(range(0, 20))
+    for clock_s, ahead_s in ((-5, 0), (3600, 0), (0, 60), (0, -60)):
+        bag.clock_ns += clock_s * 10**9
+        bag.ahead_ns += ahead_s * 10**9
+        first = bag.next_step = getattr(bag, 'next_step', 0) + 20
+        bag.walk(range(first, first + 20))
+    dataset, summary = read_recordings([bag.close()])
+    assert dataset.observations[:, 0].tolist() == list(range(100))
+    assert dataset.episode_ends.tolist() == [19, 39, 59, 79, 99]
+    assert summary.dropped == {'jumps of a clock': 4}
+
+
+def test_messages_that_waited_for_the_recorder_are_no_jump(bag) -> None:
+    bag.ahead_ns = -(10**12)
+    for step in range(0, 40):
+        bag.ahead_ns = min(bag.ahead_ns + 30 * 10**9, 0)
+        bag.walk(range(step, step + 1))
+    assert read_recordings([bag.close()], refuse_gaps=True)[0].num_episodes == 1
+
+
+@pytest.mark.parametrize('stamp_s', [1e9, 0.0, 3.0])
+def test_trajectory_is_cut_where_a_stamp_is_of_another_clock(bag, stamp_s) -> None:
+    bag.walk(range(0, 6))
+    for step in range(6, 12):
+        bag.state(step, stamp_s=stamp_s + 0.1 * step)
+        bag.action(step)
+    dataset, summary = read_recordings([bag.close()])
+    expected = {} if not stamp_s else {'jumps of the stamps': 1}
+    assert (dataset.num_episodes, summary.dropped) == (1 + len(expected), expected)
+
+
+def test_steps_that_two_simulators_publish_are_left_out(bag) -> None:
+    """A true transition is from s to s + 1 in both values."""
+    bag.walk(range(0, 10))
+    for step in range(10, 14):  # another robot one step ahead, on the same topic
+        bag.state(step, [step, 10.0])
+        bag.action(step)
+        bag.state(step + 1, [step + 1, 99.0])
+        bag.action(step + 1)
+    bag.walk(range(14, 30))
+    dataset, summary = read_recordings([bag.close()])
+    inside = ~dataset.terminals[:-1]
+    changes = np.diff(dataset.observations, axis=0)[inside]
+    np.testing.assert_array_equal(changes, np.tile([1, 0], (len(changes), 1)))
+    assert summary.dropped['transitions to a state that was recorded twice'] == 4
+    assert summary.dropped['steps back in time'] == 4
+    assert dataset.num_transitions == 10 + 15
+
+
+def test_steps_with_two_policies_are_left_out_as_long_as_the_simulator_stands(bag) -> None:
+    bag.walk(range(0, 3))
+    bag.action(2, instance=8)
+    bag.walk(range(3, 5))
+    bag.clock_ns += 2 * 10**9
+    bag.walk(range(5, 9))
+    dataset, summary = read_recordings([bag.close()])
+    assert summary.dropped == {'steps with several senders of actions': 2}
+    assert dataset.observations[:, 0].tolist() == [0, 1, 2, 4, 5, 6, 7, 8]
+
+
+def test_recording_that_is_mostly_a_mixture_is_refused(bag) -> None:
+    bag.walk(range(0, 3))
+    for step in range(3, 40):
+        for world in (0.0, 50.0):
+            bag.state(step, [world, world])
+            bag.action(step)
+    with pytest.raises(DatasetError, match=r'\d+ of \d+ steps do not follow .*one robot'):
+        read_recordings([bag.close()])
+
+
+def test_recording_whose_actions_are_of_another_clock_is_refused(bag) -> None:
+    bag.walk(range(0, 30))
+    bag.ahead_ns = 500 * 10**6
+    for step in range(30, 100):
+        bag.ahead_ns = 0
+        bag.state(step)
+        bag.ahead_ns = 500 * 10**6
+        bag.action(step)
+    with pytest.raises(DatasetError, match=r'69 of 100 actions .* different clocks'):
+        read_recordings([bag.close()])
+
+
+def test_files_of_different_recordings_are_not_joined(tmp_path: Path) -> None:
+    first, second = Bag(tmp_path / 'a.mcap'), Bag(tmp_path / 'b.mcap')
+    second.clock_ns += 3600 * 10**9
+    first.walk(range(0, 3))
+    second.walk(range(3, 6))
+    dataset, summary = read_recordings([first.close(), second.close()], refuse_gaps=True)
+    assert (dataset.episode_ends.tolist(), summary.dropped) == ([2, 5], {})
 
 
 def test_idle_steps_can_be_kept(bag) -> None:

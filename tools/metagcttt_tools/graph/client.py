@@ -77,7 +77,7 @@ class MazeClient(RobotCommander):
         """Wait until the three nodes hear each other and this program."""
         for found, what in (
             (self._set_task.service_is_ready, 'service set_task'),
-            (self._goal_pose.get_subscription_count, 'a subscriber of goal_pose'),
+            (self._goal_is_heard, 'a subscriber of goal_pose'),
             (partial(self.count_subscribers, 'action'), 'a subscriber of action'),
             (partial(self.count_subscribers, 'goal'), 'a subscriber of goal'),
             (self._reports.get_publisher_count, 'a publisher of adaptation'),
@@ -87,6 +87,12 @@ class MazeClient(RobotCommander):
             ),
         ):
             self.wait(found, what, timeout_s)
+
+    def _goal_is_heard(self) -> bool:
+        """True if every subscriber of goal_pose is matched, and one is not the recorder."""
+        readers = self.get_subscriptions_info_by_topic(self._goal_pose.topic_name)
+        matched = self._goal_pose.get_subscription_count()
+        return matched >= len(readers) and any(r.node_name != 'recorder_node' for r in readers)
 
     def drive(
         self, task_id: int, seed: int, timeout_s: float = 60.0, *, as_task: bool = False

@@ -14,6 +14,12 @@ from mcap_ros2.decoder import DecoderFactory
 from metagcttt_core.data.errors import DatasetError
 import zstandard
 
+BACK_NS = 10**9
+"""Messages that overtake others do so by less; a clock that was set back goes further."""
+
+SILENCE_NS = 10 * 10**9
+"""Nodes report their health every second: a longer silence is a clock set forward, or a break."""
+
 
 @dataclass(frozen=True)
 class Recorded:
@@ -24,12 +30,14 @@ class Recorded:
         type_name: Its type, such as `metagcttt_interfaces/msg/MazeState`.
         published_ns: When it was published, nanoseconds since 1970.
         message: The message, its fields as attributes.
+        stretch: Number of the stretch of the file, between two jumps of a clock.
     """
 
     topic: str
     type_name: str
     published_ns: int
     message: Any
+    stretch: int = 0
 
 
 @dataclass(frozen=True)
@@ -37,14 +45,62 @@ class RecordedMessages:
     """The requested messages of one file.
 
     Attributes:
-        messages: In the order of publication.
+        messages: In the order of publication, stretch by stretch.
         topics: Topics of the file with their types, asked for or not.
         complete: Whether the file was finished; otherwise its end is missing.
+        begin_ns: When its first message was logged, nanoseconds since 1970; 0 without one.
+        end_ns: When its last message was logged.
+        num_stretches: Stretches between jumps of a clock.
     """
 
     messages: list[Recorded]
     topics: dict[str, str]
     complete: bool
+    begin_ns: int = 0
+    end_ns: int = 0
+    num_stretches: int = 1
+
+    def goes_on_in(self, following: 'RecordedMessages') -> bool:
+        """True if the next file may be the next part of the same recording, by its times."""
+        return not jumps(self.end_ns, following.begin_ns)
+
+
+def jumps(before_ns: int, after_ns: int) -> bool:
+    """True if no clock goes from one time to the other between two messages of a recording."""
+    return not -BACK_NS <= after_ns - before_ns <= SILENCE_NS
+
+
+class _Clocks:
+    """Numbers the stretches of a file within which its clocks run on.
+
+    A recorder appends messages as it receives them, and receives those of a topic about as they
+    were published.
+    """
+
+    def __init__(self) -> None:
+        self.begin_ns = self.end_ns = 0
+        self.num_stretches = 1
+        self._published_ns: dict[int, int] = {}
+        self._ahead_ns: dict[int, int] = {}
+
+    def stretch(self, message: Message, *, wanted: bool) -> int:
+        """The stretch of the next message; of unwanted ones only the time of logging counts."""
+        self.begin_ns = self.begin_ns or message.log_time
+        jump = bool(self.end_ns) and jumps(self.end_ns, message.log_time)
+        self.end_ns = message.log_time
+        if wanted:
+            channel, published_ns = message.channel_id, message.publish_time
+            # Behind the recorder's clock is a message that waited; ahead of it is another clock.
+            ahead_ns = max(published_ns - message.log_time, 0)
+            jump |= published_ns < self._published_ns.get(channel, 0) - BACK_NS
+            jump |= ahead_ns > self._ahead_ns.get(channel, ahead_ns) + BACK_NS
+        if jump:
+            self._published_ns.clear()
+            self._ahead_ns.clear()
+        if wanted:
+            self._published_ns[channel], self._ahead_ns[channel] = published_ns, ahead_ns
+        self.num_stretches += jump
+        return self.num_stretches - 1
 
 
 class _File:
@@ -79,6 +135,7 @@ def read_messages(path: Path, type_names: Collection[str]) -> RecordedMessages:
     found: list[Recorded] = []
     topics: dict[str, str] = {}
     complete = False
+    clocks = _Clocks()
     try:
         with path.open('rb') as file:
             reader = StreamReader(
@@ -95,10 +152,14 @@ def read_messages(path: Path, type_names: Collection[str]) -> RecordedMessages:
                     topics[record.topic] = schema.name if schema else ''
                     if schema and schema.name in type_names:
                         decoders[record.id] = factory.decoder_for(record.message_encoding, schema)
-                elif isinstance(record, Message) and (decode := decoders.get(record.channel_id)):
+                elif isinstance(record, Message):
+                    decode = decoders.get(record.channel_id)
+                    stretch = clocks.stretch(record, wanted=decode is not None)
+                    if decode is None:
+                        continue
                     topic = channels[record.channel_id].topic
-                    content = decode(record.data)
-                    found.append(Recorded(topic, topics[topic], record.publish_time, content))
+                    content, published_ns = decode(record.data), record.publish_time
+                    found.append(Recorded(topic, topics[topic], published_ns, content, stretch))
                 elif isinstance(record, Footer):
                     complete = file.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC
                     break
@@ -117,5 +178,7 @@ def read_messages(path: Path, type_names: Collection[str]) -> RecordedMessages:
         *(ValueError, LookupError, OverflowError, MemoryError),
     ) as error:
         raise DatasetError(f'{path}: damaged ({error})') from error
-    found.sort(key=lambda recorded: recorded.published_ns)
-    return RecordedMessages(found, topics, complete)
+    found.sort(key=lambda recorded: (recorded.stretch, recorded.published_ns))
+    return RecordedMessages(
+        *(found, topics, complete), clocks.begin_ns, clocks.end_ns, clocks.num_stretches
+    )

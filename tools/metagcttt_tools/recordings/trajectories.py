@@ -2,15 +2,16 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.data.errors import DatasetError
 import numpy as np
 
-from metagcttt_tools.recordings.mcap import read_messages, Recorded
+from metagcttt_tools.recordings.mcap import read_messages, Recorded, RecordedMessages
+from metagcttt_tools.recordings.robot import MISFITS, OTHER_STATE, Robot, usual_period_s
 
 STATE = 'metagcttt_interfaces/msg/MazeState'
 ACTION = 'metagcttt_interfaces/msg/ActionCommand'
@@ -37,101 +38,16 @@ class RecordingSummary:
     unfinished: list[Path]
 
 
-@dataclass
-class _Robot:
-    """Turns one robot's messages, in the order of publication, into trajectories."""
-
-    name: str
-    keep_idle: bool
-    refuse_gaps: bool
-    dropped: Counter[str]
-    trajectories: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
-    _state: Any = None
-    _action: Any = None
-    _rows: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
-
-    def take_action(self, message: Any) -> None:
-        """Remember the newest action for the current state; the simulator does the same."""
-        state = self._state
-        if state is None or (message.episode_id, message.step) != (state.episode_id, state.step):
-            self.dropped['actions for another state than the last one'] += 1
-        elif not np.isfinite(message.values).all():
-            self.dropped['actions that are not finite'] += 1
-        else:
-            self._action = message
-
-    def take_state(self, message: Any) -> None:
-        """Add the transition to this state, or say why there is none."""
-        last = self._state
-        if not np.isfinite(message.observation).all():
-            self.dropped['states that are not finite'] += 1
-            return
-        if last is not None:
-            if (message.episode_id, message.step) == (last.episode_id, last.step) and (
-                list(message.observation) == list(last.observation)
-            ):
-                self.dropped['repeated states'] += 1
-                return
-            reason = self._break(last, message)
-            if reason:
-                self._cut(reason)
-            elif (message.episode_id, message.step) == (last.episode_id, last.step + 1):
-                self._rows.append((np.array(last.observation), np.array(self._action.values)))
-            else:
-                self.finish()  # a new episode
-        self._state, self._action = message, None
-
-    def finish(self) -> None:
-        """Close the trajectory under way with its last state, which has no action."""
-        if self._rows:
-            observations = [observation for observation, _ in self._rows]
-            actions = [action for _, action in self._rows]
-            observations.append(np.array(self._state.observation))
-            actions.append(np.zeros_like(actions[0]))
-            self.trajectories.append((self._stack(observations), self._stack(actions)))
-        self._rows = []
-
-    def _break(self, last: Any, state: Any) -> str:
-        """The reason why two states of an episode form no transition; empty if they do."""
-        if state.episode_id != last.episode_id:
-            return ''
-        if state.step <= last.step:
-            return 'steps back in time'
-        if state.step != last.step + 1:
-            return 'gaps between states'
-        if self._action is None:
-            return 'states without an action'
-        if not self.keep_idle and not self._action.query_id:
-            return 'idle steps'
-        return ''
-
-    def _cut(self, reason: str) -> None:
-        if self.refuse_gaps and reason != 'idle steps':
-            raise DatasetError(
-                f'{self.name}: {reason} after step {self._state.step} of episode '
-                f'{self._state.episode_id}'
-            )
-        self.dropped[reason] += 1
-        self.finish()
-
-    def _stack(self, rows: list[np.ndarray]) -> np.ndarray:
-        sizes = sorted({len(row) for row in rows})
-        if len(sizes) > 1:
-            raise DatasetError(
-                f'{self.name}: vectors of {sizes[0]} and {sizes[1]} values in episode '
-                f'{self._state.episode_id}; they must be equally long'
-            )
-        return np.stack(rows)
-
-
 def read_recordings(
     paths: Sequence[Path], *, keep_idle: bool = False, refuse_gaps: bool = False
 ) -> tuple[TrajectoryDataset, RecordingSummary]:
     """Recordings as trajectories: state k with the action that led from it to state k + 1.
 
     That action is the newest one for state k that was published before state k + 1. Where there is
-    none, or states are missing, the trajectory is cut. In lockstep nothing is missing, so an
-    episode is one trajectory, with the very observations and actions of the robot.
+    none, or two states do not follow one another, the trajectory is cut: states are missing, a
+    clock jumped, several robots publish on one topic, several policies send actions. In lockstep
+    nothing is missing, so an episode is one trajectory, with the very observations and actions of
+    the robot.
 
     Args:
         paths: Files of recorder_node or `ros2 bag record`; those of one split recording in order.
@@ -143,44 +59,78 @@ def read_recordings(
 
     Raises:
         DatasetError: If a file cannot be read, nothing usable is in the files, vectors differ in
-            length, or there is a gap and `refuse_gaps` is set.
+            length, most of the messages do not belong together, or there is a gap and
+            `refuse_gaps` is set.
     """
     if not paths:
         raise DatasetError('no recordings were given')
-    by_robot: dict[str, list[Recorded]] = defaultdict(list)
-    topics: dict[str, str] = {}
-    unfinished = []
-    for path in paths:
-        content = read_messages(path, (STATE, ACTION))
-        topics |= content.topics
-        if not content.complete:
-            unfinished.append(path)
-        for recorded in content.messages:
-            by_robot[recorded.topic.rpartition('/')[0]].append(recorded)
+    contents = [read_messages(path, (STATE, ACTION)) for path in paths]
+    by_robot = _by_robot(contents)
     dropped: Counter[str] = Counter()
     trajectories: list[tuple[np.ndarray, np.ndarray]] = []
     for name, messages in sorted(by_robot.items()):
-        robot = _Robot(name or '/', keep_idle, refuse_gaps, dropped)
-        for recorded in messages:
-            if recorded.type_name == STATE:
-                robot.take_state(recorded.message)
-            else:
-                robot.take_action(recorded.message)
-        robot.finish()
-        trajectories += robot.trajectories
+        states = [m.recorded.message for m in messages if m.recorded.type_name == STATE]
+        robot = Robot(name or '/', usual_period_s(states), keep_idle, refuse_gaps, dropped)
+        trajectories += _trajectories(robot, messages)
+    types = [placed.recorded.type_name for messages in by_robot.values() for placed in messages]
+    num_kept = sum(len(observations) - 1 for observations, _ in trajectories)
+    where = ', '.join(str(path) for path in paths)
+    _refuse_mixtures(where, num_kept, types.count(ACTION), dropped)
     if not trajectories:
-        raise DatasetError(_nothing_found(paths, topics, dropped))
+        topics = {name: kind for content in contents for name, kind in content.topics.items()}
+        raise DatasetError(_nothing_found(where, topics, dropped))
     dataset = _join(trajectories)
-    types = [recorded.type_name for messages in by_robot.values() for recorded in messages]
     summary = RecordingSummary(
         states=types.count(STATE),
         actions=types.count(ACTION),
         transitions=dataset.num_transitions,
         trajectories=dataset.num_episodes,
         dropped=dict(dropped),
-        unfinished=unfinished,
+        unfinished=[p for p, c in zip(paths, contents, strict=True) if not c.complete],
     )
     return dataset, summary
+
+
+class _Placed(NamedTuple):
+    """A message with its recording, counted over the files, and its stretch in that."""
+
+    recording: int
+    stretch: int
+    recorded: Recorded
+
+
+def _by_robot(contents: Sequence[RecordedMessages]) -> dict[str, list[_Placed]]:
+    """The messages by namespace; files that go on from the one before are one recording."""
+    by_robot: dict[str, list[_Placed]] = defaultdict(list)
+    recording = first_stretch = 0
+    for index, content in enumerate(contents):
+        if index and contents[index - 1].goes_on_in(content):
+            first_stretch += contents[index - 1].num_stretches - 1
+        else:
+            recording, first_stretch = index, 0
+        for recorded in content.messages:
+            stretch = first_stretch + recorded.stretch
+            by_robot[recorded.topic.rpartition('/')[0]].append(
+                _Placed(recording, stretch, recorded)
+            )
+    return by_robot
+
+
+def _trajectories(
+    robot: Robot, messages: Sequence[_Placed]
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The trajectories that a robot makes of its messages."""
+    last = messages[0]
+    for placed in messages:
+        if placed.recording != last.recording:
+            robot.finish()
+        elif placed.stretch != last.stretch:
+            robot.clock_jumped()
+        last, recorded = placed, placed.recorded
+        take = robot.take_state if recorded.type_name == STATE else robot.take_action
+        take(recorded.message, recorded.published_ns)
+    robot.finish()
+    return robot.trajectories
 
 
 def join_datasets(datasets: Iterable[TrajectoryDataset]) -> TrajectoryDataset:
@@ -214,8 +164,24 @@ def _join(trajectories: list[tuple[np.ndarray, np.ndarray]]) -> TrajectoryDatase
     )
 
 
-def _nothing_found(paths: Sequence[Path], topics: dict[str, str], dropped: Counter[str]) -> str:
-    where = ', '.join(str(path) for path in paths)
+def _refuse_mixtures(where: str, num_kept: int, num_actions: int, dropped: Counter[str]) -> None:
+    """Refuse recordings whose messages mostly do not belong together."""
+    misfits = {reason: dropped[reason] for reason in MISFITS if dropped[reason]}
+    num_misfits = sum(misfits.values())
+    if num_misfits > num_kept:
+        reasons = ', '.join(f'{count} {reason}' for reason, count in misfits.items())
+        raise DatasetError(
+            f'{where}: {num_misfits} of {num_misfits + num_kept} steps do not follow from the '
+            f'last ({reasons}): record one robot a topic, on one clock, and all of its messages'
+        )
+    if 2 * dropped[OTHER_STATE] > num_actions:
+        raise DatasetError(
+            f'{where}: {dropped[OTHER_STATE]} of {num_actions} actions are for another state than '
+            'the last one before them: were states and actions published on different clocks?'
+        )
+
+
+def _nothing_found(where: str, topics: dict[str, str], dropped: Counter[str]) -> str:
     if STATE not in topics.values() or ACTION not in topics.values():
         listed = ', '.join(f'{topic} ({name})' for topic, name in topics.items()) or 'nothing'
         return f'{where}: needs topics of {STATE} and {ACTION}, got {listed}'

@@ -21,6 +21,8 @@ SEARCH_PERIOD_S = 0.1
 QUIET_S = 0.2
 GRACE_S = 1.2
 OF_ALL_ROBOTS = ('/clock', '/diagnostics')
+OF_OPERATORS = ('goal_pose',)
+HEARD_S = 1.0
 OF_ROS = ('/rosout', '/parameter_events')
 
 
@@ -28,7 +30,9 @@ class RecorderNode(Node):
     """Records every topic of its namespace, and those that all robots share.
 
     Serialized messages go to the file unchanged. A subscription follows the QoS of the topic's
-    publishers.
+    publishers. On topics that take orders it joins late and leaves with the last publisher:
+    `ros2 topic pub --once` sends as soon as anybody listens, and an order that only the recorder
+    hears is lost.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -48,6 +52,8 @@ class RecorderNode(Node):
         )
         self._subscriptions_by_topic: dict[str, Subscription] = {}
         self._refused: set[str] = set()
+        self._inputs = {self.resolve_topic_name(name) for name in OF_OPERATORS}
+        self._published_since_s: dict[str, float] = {}
         # Not the node's clock, which stops when the simulation is paused.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(SEARCH_PERIOD_S, self._search, clock=steady)
@@ -80,6 +86,8 @@ class RecorderNode(Node):
             if not self._is_wanted(topic):
                 continue
             publishers = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
+            if topic in self._inputs and not self._is_heard(topic, bool(publishers)):
+                continue
             if not publishers:
                 continue
             profile = recording_profile(publishers)
@@ -89,6 +97,17 @@ class RecorderNode(Node):
             elif _quality(known.qos_profile) != _quality(profile):
                 self.destroy_subscription(known)
                 self._subscribe(topic, types, profile)
+
+    def _is_heard(self, topic: str, is_published: bool) -> bool:
+        """True once the readers of an input have had the time to be matched with its publisher."""
+        now_s = time.monotonic()
+        if is_published:
+            return now_s - self._published_since_s.setdefault(topic, now_s) >= HEARD_S
+        self._published_since_s.pop(topic, None)
+        subscription = self._subscriptions_by_topic.pop(topic, None)
+        if subscription is not None:
+            self.destroy_subscription(subscription)
+        return False
 
     def _is_wanted(self, topic: str) -> bool:
         if topic in OF_ROS or topic in self._refused:
