@@ -2,9 +2,11 @@ import math
 from pathlib import Path
 import re
 
+from action_msgs.msg import GoalStatus
 from metagcttt_interfaces.action import ReachGoal
 from metagcttt_interfaces.msg import EpisodeEvent, PolicyStatus
 import pytest
+from rclpy.action import ActionClient
 from tests.ros.goal_rig import ALSO_FREE, FREE, GoalRig
 from tests.ros.graph import goal_pose, Graph
 
@@ -92,6 +94,24 @@ def test_goal_is_refused_with_code_and_reason(
     assert rig.error(sent)[0] == code
     assert reason in rig.error(sent)[1]
     assert rig.record.queries == []
+
+
+def test_plain_action_client_learns_why_a_goal_is_rejected(rig: GoalRig) -> None:
+    """As `ros2 action send_goal` does, which shows nothing but the result."""
+    rig.state()
+    assert rig.commander.send(FREE).accepted
+    client = ActionClient(rig.graph.node, ReachGoal, 'reach_goal')
+    rig.graph.wait(client.server_is_ready, 'the action')
+    sent = client.send_goal_async(ReachGoal.Goal(pose=goal_pose(8.0, 0.0)))
+    rig.graph.wait(sent.done, 'the answer')
+    answer = sent.result().get_result_async()
+    rig.graph.wait(answer.done, 'the result')
+    result = answer.result().result
+    assert answer.result().status == GoalStatus.STATUS_ABORTED
+    assert (result.success, result.error_code) == (False, Result.IN_WALL)
+    assert 'in a wall, cell (1, 3)' in result.error_msg
+    assert rig.node._tracker.goal.xy == FREE
+    client.destroy()
 
 
 def test_goal_before_the_first_state_is_refused(rig: GoalRig) -> None:

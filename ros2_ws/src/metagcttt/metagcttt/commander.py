@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 import time
 from typing import Any
 import uuid
@@ -93,8 +94,8 @@ class RobotCommander(Node):
         self._reset = self.create_client(Trigger, 'reset')
         self._enable = self.create_client(SetBool, 'enable')
         self._episode_id = 0  # started by this commander; the goal node may not know it yet
-        self._refusals: dict[str, EpisodeEvent] = {}
-        self._refusals_from = self.create_subscription(
+        self._verdicts: dict[str, EpisodeEvent | None] = {}  # to goals being sent
+        self._verdicts_from = self.create_subscription(
             EpisodeEvent, 'episode', self._on_event, EVENTS
         )
 
@@ -151,27 +152,30 @@ class RobotCommander(Node):
         """Send an action goal unchanged; its `request_id` must be unique."""
         self.wait(self._reach_goal.server_is_ready, 'action reach_goal', timeout_s)
         self.wait(
-            lambda: self._refusals_from.get_publisher_count() > 0, 'topic episode', timeout_s
+            lambda: self._verdicts_from.get_publisher_count() > 0, 'topic episode', timeout_s
         )
         sent = SentGoal(self)
+        self._verdicts[request.request_id] = None
         future = self._reach_goal.send_goal_async(request, feedback_callback=sent.on_feedback)
-        self.wait(future.done, 'the answer to a goal', timeout_s)
-        handle = future.result()
-        if handle.accepted:
-            sent.begin(handle)
-            return sent
-        self.wait(
-            lambda: request.request_id in self._refusals, 'why a goal was rejected', timeout_s
-        )
-        event = self._refusals.pop(request.request_id)
-        sent.refuse(ReachResult(False, error_code=event.error_code, error_msg=event.reason))
+        try:
+            self.wait(future.done, 'the answer to a goal', timeout_s)
+            answer = partial(self._verdicts.get, request.request_id)
+            self.wait(answer, 'whether a goal was accepted', timeout_s)
+        finally:
+            event = self._verdicts.pop(request.request_id)
+        assert event is not None, 'waited for'
+        if event.kind == EpisodeEvent.GOAL_ACCEPTED:
+            sent.begin(future.result())
+        else:
+            sent.refuse(ReachResult(False, error_code=event.error_code, error_msg=event.reason))
         return sent
 
     def _on_event(self, message: EpisodeEvent) -> None:
         if message.kind == EpisodeEvent.STARTED and message.episode_id != self._episode_id:
             self._episode_id = 0  # started by another node
-        if message.kind == EpisodeEvent.GOAL_REJECTED and message.request_id:
-            self._refusals[message.request_id] = message
+        is_answer = message.kind in (EpisodeEvent.GOAL_ACCEPTED, EpisodeEvent.GOAL_REJECTED)
+        if is_answer and message.request_id in self._verdicts:
+            self._verdicts[message.request_id] = message
 
     # --- services ----------------------------------------------------------------------------
 

@@ -85,7 +85,7 @@ class GoalNode(Node):
         self.create_subscription(PolicyStatus, 'policy_status', self._on_policy, LATCHED)
         self._reach_goal = ReachGoalServer(
             self,
-            is_acceptable=self._is_acceptable,
+            refusal=self._refusal,
             begin=lambda request: self._publish(
                 self._tracker.accept(self._to_request(request), self._now())
             ),
@@ -121,13 +121,13 @@ class GoalNode(Node):
             request_id=message.request_id,
         )
 
-    def _is_acceptable(self, message: ReachGoal.Goal) -> bool:
-        """Check an action goal, and publish the reason if it cannot be accepted."""
+    def _refusal(self, message: ReachGoal.Goal) -> Verdict | None:
+        """The reason why an action goal cannot be served, which is published; None when it can."""
         request = self._to_request(message)
         refusal = self._tracker.refusal(request)
         if refusal is not None:
             self._publish([self._tracker.reject(request, refusal)])
-        return refusal is None
+        return refusal
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
         request = self._to_request(ReachGoal.Goal(pose=message))

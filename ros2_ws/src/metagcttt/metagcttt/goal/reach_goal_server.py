@@ -6,11 +6,11 @@ import time
 
 from metagcttt_interfaces.action import ReachGoal
 from metagcttt_interfaces.msg import PolicyStatus
-from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action import ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
-from metagcttt.goal.goals import AcceptedGoal, RobotState
+from metagcttt.goal.goals import AcceptedGoal, RobotState, Verdict
 from metagcttt.goal.tracker import Ended
 
 FEEDBACK_PERIOD_S = 0.1
@@ -65,7 +65,7 @@ class ReachGoalServer:
         self,
         node: Node,
         *,
-        is_acceptable: Callable[[ReachGoal.Goal], bool],
+        refusal: Callable[[ReachGoal.Goal], Verdict | None],
         begin: Callable[[ReachGoal.Goal], None],
         cancel: Callable[[], None],
     ) -> None:
@@ -73,12 +73,12 @@ class ReachGoalServer:
 
         Args:
             node: The node that owns it.
-            is_acceptable: Whether a request is accepted; publishes the reason if not.
+            refusal: The reason why a request is refused, which it publishes; None when it is not.
             begin: Puts an acceptable request in force, after `finish` for the goal it replaces.
             cancel: Ends the goal under way, with `finish`.
         """
         self._node = node
-        self._is_acceptable = is_acceptable
+        self._refusal = refusal
         self._begin = begin
         self._cancel = cancel
         self._handle: ServerGoalHandle | None = None
@@ -89,7 +89,6 @@ class ReachGoalServer:
             ReachGoal,
             'reach_goal',
             execute_callback=ReachGoal.Result,  # never called
-            goal_callback=self._on_request,
             handle_accepted_callback=self._on_accepted,
             cancel_callback=self._on_cancel,
         )
@@ -127,10 +126,16 @@ class ReachGoalServer:
         """Destroy the action server."""
         self._server.destroy()
 
-    def _on_request(self, request: ReachGoal.Goal) -> GoalResponse:
-        return GoalResponse.ACCEPT if self._is_acceptable(request) else GoalResponse.REJECT
-
     def _on_accepted(self, handle: ServerGoalHandle) -> None:
+        # Rejected by the protocol, a goal has no result, and its sender would not learn why.
+        refusal = self._refusal(handle.request)
+        if refusal is not None:
+            handle.execute()
+            handle.abort()
+            code = getattr(ReachGoal.Result, refusal.error)
+            result = ReachGoal.Result(error_code=code, error_msg=refusal.reason)
+            self._server.give_result(handle, result)
+            return
         self._begin(handle.request)
         self._handle = handle
         handle.execute()
