@@ -1,7 +1,7 @@
 import time
 
 from metagcttt.sim.node import SimBridgeNode
-from metagcttt_interfaces.msg import ActionCommand, EpisodeEvent
+from metagcttt_interfaces.msg import ActionCommand, EpisodeEvent, MazeState
 from nav_msgs.msg import OccupancyGrid
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from sim_bridge import make_simulator
 from std_srvs.srv import SetBool, Trigger
-from tests.ros.graph import ANY, EVERY, Graph, Record
+from tests.ros.graph import ANY, EVERY, Graph, Record, RELIABLE
 
 pytestmark = pytest.mark.mujoco
 
@@ -21,6 +21,14 @@ def answer(state, values=(1.0, 0.0), **changes) -> ActionCommand:
 
 def seconds(stamp) -> float:
     return stamp.sec + 1e-9 * stamp.nanosec
+
+
+def test_reliable_subscriber_receives_states_in_realtime(graph: Graph) -> None:
+    graph.add(SimBridgeNode, speed_factor=5.0)
+    states = graph.collect(MazeState, 'state', RELIABLE)
+    graph.wait(lambda: len(states) > 5, 'states')
+    steps = [state.step for state in states]
+    assert steps == list(range(steps[0], steps[0] + len(steps)))
 
 
 def test_lockstep_episode_equals_the_simulator(graph: Graph) -> None:

@@ -42,6 +42,19 @@ def state_profile(stepping: str) -> QoSProfile:
     return LATCHED if stepping == 'lockstep' else SENSOR
 
 
+def state_offer(stepping: str) -> QoSProfile:
+    """The profile that the publisher of `state` offers: deep, and reliable for those who ask.
+
+    The nodes ask for less in realtime, where a state that was lost is not worth its repetition.
+    """
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=RECORDED_DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=state_profile(stepping).durability,
+    )
+
+
 RECORDED_DEPTH = 1000
 """Messages kept for a slow reader such as the recorder; in lockstep a second's or more."""
 

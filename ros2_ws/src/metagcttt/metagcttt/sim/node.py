@@ -36,9 +36,8 @@ from metagcttt.qos import (
     EVENTS,
     keep_several,
     LATCHED,
-    RECORDED_DEPTH,
     SENSOR,
-    state_profile,
+    state_offer,
 )
 from metagcttt.sim.health import SimMonitor
 from metagcttt.sim.pacing import Pacer
@@ -87,8 +86,8 @@ class SimBridgeNode(Node):
         self._paused = bool(self._settings['start_paused'])
         self._awaiting: NDArray[np.float64] | None = None  # lockstep: received while paused
 
-        profile = keep_several(state_profile(self._settings['stepping']), RECORDED_DEPTH)
-        self._states = self.create_publisher(MazeState, 'state', profile)
+        offer = state_offer(self._settings['stepping'])
+        self._states = self.create_publisher(MazeState, 'state', offer)
         self._events = self.create_publisher(EpisodeEvent, 'episode', EVENTS)
         self._map = self.create_publisher(OccupancyGrid, 'map', LATCHED)
         self._clock_messages = None
