@@ -131,6 +131,14 @@ def test_lifecycle_through_its_services(make_rig) -> None:
     assert label(rig) == 'finalized'
 
 
+@pytest.mark.parametrize('transition', [99, 255, Transition.TRANSITION_ACTIVATE])
+def test_transition_that_there_is_not_changes_nothing(make_rig, transition: int) -> None:
+    rig = make_rig(autostart=False)
+    assert not change(rig, transition)
+    assert label(rig) == 'unconfigured'
+    assert change(rig, Transition.TRANSITION_CONFIGURE)
+
+
 def test_deactivation_in_realtime_sends_a_zero_action(make_rig) -> None:
     rig = make_rig(stepping='realtime', adapt_steps=0, rate_hz=5.0, state_timeout_s=30.0)
     rig.goal()
