@@ -44,6 +44,7 @@ NOT_RUN = {
     r'ros2 (launch|topic|run) .*': 'needs ROS 2 of the machine',
     r'tools/ros2run .*': 'tests/ros/test_documentation.py runs them',
     r'metagcttt download .*': 'needs the network; tests/tools/test_download.py has a stand-in',
+    r'metagcttt (contract check .* --bag|import-bags|inspect) .*': 'tests/tools/robots has bags',
     r'np\.savez.*': 'is of the JAX program',
     r'python -m torch\.distributed\.run .*': 'tests/tools/common/test_session.py runs it',
     r'metagcttt (report|sweep|evaluate-ros)( .*)?': 'tests/tools has them on a small study',
@@ -70,7 +71,7 @@ def reason_not_to_run(command: str) -> str:
 @pytest.fixture
 def workplace(tmp_path: Path) -> Path:
     """A folder with what a checkout has, in which commands may write."""
-    for name in ('assets', 'tools', 'constraints.txt'):
+    for name in ('assets', 'config', 'tools', 'constraints.txt'):
         (tmp_path / name).symlink_to(ROOT / name)
     with np.load(DATA / 'nets_gciql_ant.npz') as arrays:  # stands for the JAX program's file
         params = {key.removeprefix('init.'): arrays[key] for key in arrays if 'init.' in key}

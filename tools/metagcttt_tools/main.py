@@ -39,6 +39,7 @@ PROGRAMS: dict[str, Program | Group] = {
     'download': Program('download', "Download one of OGBench's published datasets."),
     'import-recordings': Program('import_recordings', 'Turn recordings into a dataset.'),
     'import-bags': Program('import_bags', 'Turn bags of a robot into a dataset, by its contract.'),
+    'inspect': Program('inspect_data', 'Say what is in a dataset, and draw its coverage.'),
     'pretrain': Program('pretrain', 'Pre-train a policy on an offline dataset.'),
     'convert': Program('convert', "Convert a policy trained with OGBench's own code."),
     'meta-train': Program('meta_train', 'Meta-post-train a policy (Algorithm 1).'),

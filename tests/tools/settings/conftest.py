@@ -9,6 +9,7 @@ from metagcttt_core.training.config import PretrainConfig
 from metagcttt_core.training.pretrain import pretrain
 import pytest
 from tests.core.builders import DATA, maze_walks, tiny_agent
+from tests.core.robot.messages import DRIVE
 
 
 @pytest.fixture(scope='session')
@@ -48,4 +49,5 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
             path.with_suffix('.json').touch()  # says that it is complete
     for name in ('nets_gcbc_pm', 'nets_gcbc_ant', 'nets_gciql_pm'):
         shutil.copy(DATA / f'{name}.npz', folder)
+    (folder / 'cart.yaml').write_text(DRIVE)
     return folder

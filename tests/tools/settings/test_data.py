@@ -13,6 +13,7 @@ from metagcttt_tools import (
     download,
     generate,
     import_bags,
+    inspect_data,
     top_view,
 )
 from metagcttt_tools.common import plots
@@ -145,6 +146,26 @@ IMPORT_BAGS = Walk(
         'overwrite': Proof(True, again=True),
     },
     watch_bags,
+)
+
+
+def watch_inspection(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    patch.setattr(inspect_data, 'inspect', lambda data: seen.append(data.fingerprint))
+    patch.setattr(inspect_data, 'describe', lambda found, *names: seen.append(names))
+    patch.setattr(plots, 'places_picture', lambda places, *names: seen.append((places[0], names)))
+    note_pictures(patch, seen)
+
+
+INSPECT = Walk(
+    'inspect',
+    {'data': '@walks.npz'},
+    {
+        'data': '@half.npz',
+        'contract': Proof('@cart.yaml', refused='the contract of cart has 4 and 2'),
+        'coverage': [1, 0],
+        'out': 'elsewhere.png',
+    },
+    watch_inspection,
 )
 WITH_CRITIC = {'agent': 'gciql', 'file': '@nets_gciql_pm.npz'}
 CONVERT = Walk(
@@ -357,6 +378,7 @@ WALKS = (
     IMPORT,
     IMPORT_BAGS,
     CONTRACT_CHECK,
+    INSPECT,
     CONVERT,
     PACK,
     DIAGNOSTICS,

@@ -110,6 +110,22 @@ def coverage_picture(maze: MazeMap, positions: np.ndarray, bins_per_cell: int = 
     return figure
 
 
+def places_picture(places: np.ndarray, x_name: str, y_name: str) -> Figure:
+    """How often each place was visited, without a map.
+
+    Args:
+        places: (N, 2) values along x and y.
+        x_name: What x is.
+        y_name: What y is.
+    """
+    figure = Figure(figsize=(5, 5), layout='constrained')
+    axes = figure.subplots()
+    counts = axes.hexbin(places[:, 0], places[:, 1], gridsize=60, bins='log', mincnt=1)
+    axes.set(xlabel=x_name, ylabel=y_name)
+    figure.colorbar(counts, label='rows')
+    return figure
+
+
 def controller_picture(walks: Sequence[Sequence[Walk]]) -> Figure:
     """Paths and speed along each direction; one sequence of walks a direction."""
     figure = Figure(figsize=(8.4, 3.8), layout='constrained')
