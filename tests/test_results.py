@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 import re
 
+from metagcttt_core import success_statistics
 from metagcttt_tools import report
 from metagcttt_tools.common.differences import differences, paired_difference
 from metagcttt_tools.common.evidence import format_evidence, read_evidence
@@ -56,6 +57,7 @@ def test_results_come_from_committed_code():
     """Those of old that do not are listed, and no others."""
     names = {name for artefact in WITH_RESULTS for name in artefact.files}
     names |= {path.name for path in RESULTS.glob('*-cpu.json')}
+    names |= {path.name for path in RESULTS.glob('*-table3-*.json')}
     dirty = set()
     for name in names:
         results = read(name)
@@ -135,6 +137,23 @@ def test_table_of_the_small_policies_in_the_readme():
     for label, result in zip(('base', 'post-trained (TT-REPTILE)'), results, strict=True):
         cells = [f'{p["success"]:.2f} ± {p["standard_error"]:.2f}' for p in result['curve']]
         assert f'| {label} | {" | ".join(cells)} | {result["auc"]:.3f} |' in text
+
+
+@pytest.mark.parametrize(
+    ('state', 'label'), [('fresh', 'fresh'), ('pretrained', 'of pre-training')]
+)
+def test_table_of_both_optimiser_states(state, label):
+    text = squeezed((RESULTS / 'README.md').read_text())
+    report = read(f'pointmaze-medium-navigate-table3-base-{state}.json')
+    assert report['settings']['ttt']['optimizer_state'] == state
+    assert len(report['results']) == 3
+    points = zip(*(result['curve'] for result in report['results']), strict=True)
+    rates = [success_statistics([p['success'] for p in seeds]) for seeds in points]
+    area = success_statistics([result['auc'] for result in report['results']])
+    cells = [f'{rate.mean:.2f} ± {rate.standard_error:.2f}' for rate in rates]
+    assert (
+        f'| {label} | {" | ".join(cells)} | {area.mean:.3f} ± {area.standard_error:.3f} |' in text
+    )
 
 
 @pytest.mark.parametrize(
