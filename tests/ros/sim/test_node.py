@@ -54,6 +54,17 @@ def test_lockstep_episode_equals_the_simulator(graph: Graph) -> None:
     np.testing.assert_allclose(period, 0.1)
 
 
+def test_tasks_of_a_humanoid_start_standing_on_request(graph: Graph) -> None:
+    graph.add(
+        SimBridgeNode, stepping='lockstep', environment='humanoidmaze-medium-v0', standing=True
+    )
+    task = graph.set_task(1, seed=3)
+    with make_simulator('humanoidmaze-medium-v0', standing=True) as simulator:
+        observation, goal = simulator.reset(task_id=1, seed=3)
+    assert list(task.observation) == observation.tolist()
+    assert list(task.goal) == goal.tolist()
+
+
 def test_lockstep_ignores_actions_for_other_states(graph: Graph) -> None:
     graph.add(SimBridgeNode, stepping='lockstep')
     states = Record(graph, EVERY).states
