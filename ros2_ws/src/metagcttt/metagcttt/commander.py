@@ -92,7 +92,9 @@ class RobotCommander(Node):
         self._set_task = self.create_client(SetTask, 'set_task')
         self._reset = self.create_client(Trigger, 'reset')
         self._enable = self.create_client(SetBool, 'enable')
-        self._episode_id = 0  # started by this commander; the goal node may not know it yet
+        # Started by this commander; the goal node may not know it yet.
+        self._episode_id = self._world_id = 0
+        self._requests: set[str] = set()  # those under way
         self._refusals: dict[str, EpisodeEvent] = {}
         self._refusals_from = self.create_subscription(
             EpisodeEvent, 'episode', self._on_event, EVENTS
@@ -136,7 +138,10 @@ class RobotCommander(Node):
         """
         values = to_floats(goal)
         request = ReachGoal.Goal(
-            max_steps=max_steps, episode_id=self._episode_id, request_id=uuid.uuid4().hex
+            max_steps=max_steps,
+            episode_id=self._episode_id,
+            world_id=self._world_id,
+            request_id=uuid.uuid4().hex,
         )
         request.pose = PoseStamped()
         request.pose.header.frame_id = self._frame_id
@@ -153,24 +158,30 @@ class RobotCommander(Node):
         self.wait(
             lambda: self._refusals_from.get_publisher_count() > 0, 'topic episode', timeout_s
         )
+        self._requests.add(request.request_id)
         sent = SentGoal(self)
         future = self._reach_goal.send_goal_async(request, feedback_callback=sent.on_feedback)
         self.wait(future.done, 'the answer to a goal', timeout_s)
         handle = future.result()
         if handle.accepted:
+            self._requests.discard(request.request_id)
             sent.begin(handle)
             return sent
         self.wait(
             lambda: request.request_id in self._refusals, 'why a goal was rejected', timeout_s
         )
+        self._requests.discard(request.request_id)
         event = self._refusals.pop(request.request_id)
         sent.refuse(ReachResult(False, error_code=event.error_code, error_msg=event.reason))
         return sent
 
     def _on_event(self, message: EpisodeEvent) -> None:
-        if message.kind == EpisodeEvent.STARTED and message.episode_id != self._episode_id:
-            self._episode_id = 0  # started by another node
-        if message.kind == EpisodeEvent.GOAL_REJECTED and message.request_id:
+        episode = (self._world_id, self._episode_id)
+        if message.kind == EpisodeEvent.STARTED and (
+            (message.world_id, message.episode_id) != episode
+        ):
+            self._episode_id = self._world_id = 0  # started by another node
+        if message.kind == EpisodeEvent.GOAL_REJECTED and message.request_id in self._requests:
             self._refusals[message.request_id] = message
 
     # --- services ----------------------------------------------------------------------------
@@ -182,12 +193,12 @@ class RobotCommander(Node):
         request = SetTask.Request(task_id=task_id, seed=seed, send_goal=send_goal)
         response = self._call(self._set_task, request, timeout_s)
         if response.success:
-            self._episode_id = response.episode_id
+            self._episode_id, self._world_id = response.episode_id, response.world_id
         return response
 
     def reset(self, timeout_s: float = 10.0) -> Trigger.Response:
         """Start an episode without a task, at a random position."""
-        self._episode_id = 0
+        self._episode_id = self._world_id = 0
         return self._call(self._reset, Trigger.Request(), timeout_s)
 
     def enable(self, enabled: bool, timeout_s: float = 10.0) -> SetBool.Response:
