@@ -26,9 +26,9 @@ class WorldOrder:
     """Follows a source of states through its steps, episodes and worlds.
 
     In a world, time does not run backwards: what is older than the newest state is refused.
-    Another world replaces the present one unless it was published before it. A source without identity
-    shows only by older numbers that it has begun again, which stray states have too. So they count
-    as another world once `restart_states` of them follow one another.
+    Another world replaces the present one unless it was published before it. A source without
+    identity shows only by older numbers that it has begun again, which stray states have too. So
+    they count as another world once `restart_states` of them follow one another.
 
     Attributes:
         now: The newest moment; None before the first.
