@@ -180,7 +180,7 @@ def test_older_episodes_that_are_heard_of_late_leave_the_goal(rig: Rig) -> None:
     rig.state(episode_id=7)
     rig.send(4.0, 0.0)
     rig.query(1)
-    before = {'source_timestamp': rig.node._tracker._published_ns - 1}
+    before = {'source_timestamp': rig.node._tracker._order._published_ns - 1}
     rig.node._on_event(EpisodeEvent(kind=EpisodeEvent.STARTED, episode_id=1), before)
     assert rig.node._tracker.goal is not None
 

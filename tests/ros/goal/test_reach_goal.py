@@ -239,6 +239,31 @@ def test_vanished_simulator_ends_the_goal_in_lockstep(make_rig) -> None:
     assert rig.error(sent)[0] == Result.STATE_LOST
 
 
+def test_policy_that_is_gone_ends_the_goal_in_lockstep(make_rig) -> None:
+    rig = make_rig(partner_timeout_s=0.3)
+    rig.state()
+    code, message = rig.error(rig.commander.send(FREE))
+    assert (code, 'no step and no status of the policy' in message) == (Result.POLICY_LOST, True)
+
+
+def test_goal_after_one_that_waited_in_vain_is_for_the_running_episode(make_rig) -> None:
+    rig = make_rig(state_timeout_s=0.3)
+    rig.state()
+    never = ReachGoal.Goal(pose=goal_pose(*FREE), episode_id=1000, request_id='never')
+    assert rig.error(rig.commander.send_request(never))[0] == Result.STATE_LOST
+    sent = rig.commander.send(FREE)
+    rig.state(*FREE, step=1)
+    assert sent.result().success
+
+
+def test_restarted_simulator_ends_the_goal_although_it_counts_alike(rig: GoalRig) -> None:
+    rig.state(step=3, world_id=10)
+    sent = rig.commander.send(FREE)
+    rig.state(*FREE, step=4, world_id=11)
+    code, message = rig.error(sent)
+    assert (code, 'started again' in message) == (Result.NEW_EPISODE, True)
+
+
 def test_goal_node_that_goes_down_ends_the_goal(rig: GoalRig) -> None:
     rig.state()
     sent = rig.commander.send(FREE)
@@ -254,5 +279,5 @@ def test_every_error_code_is_provoked_here() -> None:
         .joinpath('ros2_ws/src/metagcttt_interfaces/action/ReachGoal.action')
     )
     named = re.findall(r'^uint16 (\w+)=', definition.read_text(encoding='utf-8'), re.MULTILINE)
-    assert len(named) == 15
+    assert len(named) == 16
     assert [name for name in named if f'Result.{name}' not in source] == []

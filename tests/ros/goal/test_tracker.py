@@ -4,7 +4,16 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import invariant, rule, RuleBasedStateMachine
 from metagcttt.goal.goals import GoalCatalog, RobotState, Verdict
-from metagcttt.goal.tracker import Accepted, Ended, GoalRequest, GoalTracker, Now, Rejected
+from metagcttt.goal.tracker import (
+    Accepted,
+    Ended,
+    GoalRequest,
+    GoalTracker,
+    Ignored,
+    Now,
+    Rejected,
+)
+from metagcttt.worlds import Moment
 from metagcttt_core import TrajectoryFilter
 import numpy as np
 import pytest
@@ -28,9 +37,13 @@ def to(xy=FREE, **fields) -> GoalRequest:
     return GoalRequest(seed=0, **{'xy': xy, 'frame_id': 'map', **fields})
 
 
-def see(tracker: GoalTracker, episode_id: int, step: int = 0, xy=(0.0, 0.0), **flags):
+def see(tracker: GoalTracker, episode_id: int, step: int = 0, xy=(0.0, 0.0), now_ns=0, **flags):
     state = RobotState(episode_id, step, xy, **flags)
-    return tracker.on_state(state, 10 * step, START, tolerance_m=1.0, max_steps=50)
+    return tracker.on_state(state, now_ns or 10 * step, START, tolerance_m=1.0, max_steps=50)
+
+
+def begin(tracker: GoalTracker, episode_id: int, published_ns: int, task=None, world_id: int = 0):
+    return tracker.on_episode(Moment(world_id, episode_id), published_ns, START, task)
 
 
 def kinds(changes) -> list[str]:
@@ -39,6 +52,7 @@ def kinds(changes) -> list[str]:
         if isinstance(change, Ended | Rejected)
         else f'Accepted {change.goal.query_id}'
         for change in changes
+        if not isinstance(change, Ignored)
     ]
 
 
@@ -57,24 +71,26 @@ def test_end_by_a_new_episode_has_the_last_step_of_the_goal_s_own(
     see(tracker, 1, step=3)
     tracker.request(to(), START)
     see(tracker, 1, step=8)
-    [ended] = see(tracker, 2) if by == 'state' else tracker.on_episode(2, 10**9, START)
+    [ended] = see(tracker, 2, now_ns=10**9) if by == 'state' else begin(tracker, 2, 10**9)
     assert (ended.verdict, ended.step) == (Verdict('NEW_EPISODE', 'episode 2 began'), 8)
     assert ended.goal.first_step == 3
 
 
 def test_goal_for_an_announced_episode_begins_with_its_first_step(tracker: GoalTracker) -> None:
     see(tracker, 1, step=30)
-    tracker.on_episode(2, 10**9, START)
+    begin(tracker, 2, 10**9)
     assert tracker.state is None
     [accepted] = tracker.request(to(), START)
     assert (accepted.goal.episode_id, accepted.goal.first_step) == (2, 0)
-    assert see(tracker, 1, step=31, xy=FREE) == []  # of the episode before, still on its way
-    assert kinds(see(tracker, 2, step=1, xy=FREE)) == ['Ended NONE']
+    assert (
+        kinds(see(tracker, 1, step=31, xy=FREE)) == []
+    )  # of the episode before, still on its way
+    assert kinds(see(tracker, 2, step=1, xy=FREE, now_ns=10**9)) == ['Ended NONE']
 
 
 def test_restarted_simulator_is_the_newest_episode(tracker: GoalTracker) -> None:
     see(tracker, 3, step=9)
-    tracker.on_episode(1, 10**9, START)
+    begin(tracker, 1, 10**9)
     [accepted] = tracker.request(to(), START)
     assert accepted.goal.episode_id == 1
 
@@ -82,21 +98,21 @@ def test_restarted_simulator_is_the_newest_episode(tracker: GoalTracker) -> None
 def test_latched_event_from_before_the_newest_state_is_ignored(tracker: GoalTracker) -> None:
     see(tracker, 3, step=9)
     tracker.request(to(), START)
-    assert tracker.on_episode(1, 89, START, to(ALSO_FREE, is_task=True)) == []
+    assert kinds(begin(tracker, 1, 89, to(ALSO_FREE, is_task=True))) == []
     assert tracker.goal.episode_id == 3
 
 
 def test_steps_of_a_task_count_from_the_start_of_the_episode(tracker: GoalTracker) -> None:
     see(tracker, 1, step=30)  # which came before the event
     task = to(observation=np.array(FREE), frame_id='', episode_id=1, is_task=True)
-    [accepted] = tracker.on_episode(1, 0, START, task)
+    [accepted] = begin(tracker, 1, 0, task)
     assert accepted.goal.first_step == 0
     assert kinds(see(tracker, 1, step=50)) == ['Ended TIMED_OUT']
 
 
 def lost(tracker: GoalTracker, steady_s: float, clock_s: float, has_source: bool = True) -> str:
     now = Now(100.0 + steady_s, clock_s)
-    changes = tracker.on_time(now, has_source=has_source, timeout_s=1.0)
+    changes = tracker.on_time(now, has_source=has_source, timeout_s=1.0, partner_timeout_s=60.0)
     return changes[0].verdict.reason if changes else ''
 
 
@@ -108,6 +124,61 @@ def test_lockstep_goal_is_lost_with_its_source_or_its_episode(tracker: GoalTrack
     assert lost(tracker, 51.5, 51.0, has_source=False) == 'no state of episode 1 for 1.5 s'
     tracker.request(to(episode_id=7), START)
     assert lost(tracker, 53.0, 53.0) == 'no state of episode 7 for 3.0 s'
+
+
+def test_goal_for_a_future_episode_leaves_the_present_as_it_is(tracker: GoalTracker) -> None:
+    see(tracker, 1, step=3)
+    tracker.request(to(), START)
+    changes = tracker.request(to(episode_id=1000), START)
+    assert kinds(changes) == ['Ended PREEMPTED', 'Accepted 2']
+    assert tracker.state is None
+    assert kinds(see(tracker, 1, step=4, xy=FREE)) == []  # not its episode
+    assert lost(tracker, 1.5, 1.5) == 'no state of episode 1000 for 1.5 s'
+    [accepted] = tracker.request(to(), START)
+    assert (accepted.goal.episode_id, accepted.goal.first_step) == (1, 4)
+    assert kinds(see(tracker, 1, step=5, xy=FREE)) == ['Ended NONE']
+
+
+def test_goal_ends_with_its_world_although_the_next_has_the_same_numbers(
+    tracker: GoalTracker,
+) -> None:
+    see(tracker, 1, step=3, world_id=0xA)
+    tracker.request(to(), START)
+    [ended] = see(tracker, 1, step=3, xy=FREE, now_ns=40, world_id=0xB)
+    reason = 'the simulator was started again: episode 1 began'
+    assert ended.verdict == Verdict('NEW_EPISODE', reason)
+    [accepted] = tracker.request(to(), START)
+    assert accepted.goal.world_id == 0xB
+    assert kinds(see(tracker, 1, step=9, xy=FREE, now_ns=35, world_id=0xA)) == []
+    assert tracker.goal is accepted.goal
+
+
+def test_goal_may_wait_for_a_world_that_is_named(tracker: GoalTracker) -> None:
+    see(tracker, 1, step=3, world_id=0xA)
+    assert kinds(tracker.request(to(world_id=0xB), START)) == ['Rejected EPISODE_OVER']
+    tracker.request(to(episode_id=1, world_id=0xB), START)
+    assert kinds(see(tracker, 1, step=4, xy=FREE, world_id=0xA)) == []
+    assert kinds(begin(tracker, 1, 50, world_id=0xB)) == []
+    assert kinds(see(tracker, 1, xy=FREE, now_ns=60, world_id=0xB)) == ['Ended NONE']
+
+
+def test_lockstep_goal_ends_when_the_policy_is_gone(tracker: GoalTracker) -> None:
+    see(tracker, 1)
+    tracker.request(to(), START)
+
+    def ends(after_s: float) -> list[str]:
+        now = Now(100.0 + after_s, 0.0)
+        return kinds(tracker.on_time(now, has_source=True, timeout_s=9.0, partner_timeout_s=1.0))
+
+    assert ends(0.9) == []
+    tracker.on_partner(Now(100.9, 0.0))  # long adaptations are no silence
+    assert ends(1.8) == []
+    assert ends(2.0) == ['Ended POLICY_LOST']
+
+
+def test_request_with_an_endless_name_is_refused(tracker: GoalTracker) -> None:
+    see(tracker, 1)
+    assert kinds(tracker.request(to(request_id='x' * 257), START)) == ['Rejected WRONG_SIZE']
 
 
 @pytest.mark.parametrize('silence', [(1.5, 0.0), (0.0, 1.5)], ids=['real', 'simulated'])
@@ -122,6 +193,7 @@ def test_realtime_goal_is_lost_by_either_clock(silence: tuple[float, float]) -> 
 # --- random sequences ---------------------------------------------------------------------------
 
 episodes = st.integers(0, 4)
+worlds = st.sampled_from([0, 0xA, 0xB])
 spots = st.sampled_from([FREE, ALSO_FREE, (0.0, 0.0), IN_WALL, (100.0, 0.0), (np.nan, 0.0)])
 
 
@@ -152,17 +224,23 @@ class Life(RuleBasedStateMachine):
                     assert step >= goal.first_step
                     assert seconds >= 0
 
-    @rule(spot=spots, episode_id=episodes, frame=st.sampled_from(['map', 'map', 'odom']))
-    def request(self, spot, episode_id: int, frame: str) -> None:
+    @rule(
+        spot=spots,
+        episode_id=episodes,
+        world_id=worlds,
+        frame=st.sampled_from(['map', 'map', 'odom']),
+    )
+    def request(self, spot, episode_id: int, world_id: int, frame: str) -> None:
         before = self.tracker.goal
-        request = to(spot, episode_id=episode_id, frame_id=frame)
+        request = to(spot, episode_id=episode_id, frame_id=frame, world_id=world_id)
         changes = self.tracker.request(request, self.now)
-        self.follow(changes, 'PREEMPTED', 'NEW_EPISODE')
+        self.follow(changes, 'PREEMPTED')
         if isinstance(changes[-1], Rejected):
             assert len(changes) == 1
             assert self.tracker.goal is before
         else:
             assert episode_id in (0, self.tracker.goal.episode_id)
+            assert world_id in (0, self.tracker.goal.world_id)
 
     @rule(
         episode_id=episodes.filter(bool),
@@ -171,8 +249,9 @@ class Life(RuleBasedStateMachine):
         published_ns=st.integers(0, 9),
         ended=st.booleans(),
         success=st.booleans(),
+        world_id=worlds,
     )
-    def state(self, episode_id: int, step: int, spot, published_ns: int, **flags: bool) -> None:
+    def state(self, episode_id: int, step: int, spot, published_ns: int, **flags) -> None:
         before = self.tracker.goal
         changes = self.tracker.on_state(
             RobotState(episode_id, step, spot, **flags),
@@ -181,10 +260,15 @@ class Life(RuleBasedStateMachine):
             tolerance_m=1.0,
             max_steps=50,
         )
-        own = before is not None and before.episode_id == episode_id
-        self.follow(
-            changes, *(('NONE', 'TIMED_OUT', 'EPISODE_ENDED') if own else ('NEW_EPISODE',))
+        self.follow(changes, 'NONE', 'TIMED_OUT', 'EPISODE_ENDED', 'NEW_EPISODE')
+        if any(isinstance(change, Ignored) for change in changes):
+            assert self.tracker.goal is before
+            return
+        own = before is not None and (
+            before.episode_id == episode_id and before.world_id in (0, flags['world_id'])
         )
+        for change in changes:
+            assert own or change.verdict.error == 'NEW_EPISODE'
         if own and flags['ended']:
             assert self.tracker.goal is None
 
@@ -192,22 +276,32 @@ class Life(RuleBasedStateMachine):
         episode_id=episodes.filter(bool),
         published_ns=st.integers(0, 9),
         spot=st.none() | spots,
+        world_id=worlds,
     )
-    def episode(self, episode_id: int, published_ns: int, spot) -> None:
+    def episode(self, episode_id: int, published_ns: int, spot, world_id: int) -> None:
         task = None
         if spot is not None:
-            task = to(observation=np.array(spot), episode_id=episode_id, is_task=True)
-        changes = self.tracker.on_episode(episode_id, published_ns, self.now, task)
+            task = to(
+                observation=np.array(spot),
+                episode_id=episode_id,
+                is_task=True,
+                world_id=world_id,
+            )
+        start = Moment(world_id, episode_id)
+        changes = self.tracker.on_episode(start, published_ns, self.now, task)
         self.follow(changes, 'NEW_EPISODE', 'PREEMPTED')
         for change in changes:
             if isinstance(change, Accepted):
                 assert change.goal.episode_id == episode_id
+                assert change.goal.world_id == world_id
 
     @rule(seconds=st.floats(0, 3), has_source=st.booleans())
     def time(self, seconds: float, has_source: bool) -> None:
         self.now = Now(self.now.steady_s + seconds, self.now.clock_s + 2 * seconds)
-        changes = self.tracker.on_time(self.now, has_source=has_source, timeout_s=1.0)
-        self.follow(changes, 'STATE_LOST')
+        changes = self.tracker.on_time(
+            self.now, has_source=has_source, timeout_s=1.0, partner_timeout_s=5.0
+        )
+        self.follow(changes, 'STATE_LOST', 'POLICY_LOST')
 
     @rule()
     def cancel(self) -> None:
@@ -222,7 +316,9 @@ class Life(RuleBasedStateMachine):
     @invariant()
     def a_goal_is_in_force_in_its_own_episode_only(self) -> None:
         goal, state = self.tracker.goal, self.tracker.state
-        assert goal is None or state is None or state.episode_id == goal.episode_id
+        if goal is not None and state is not None:
+            assert state.episode_id == goal.episode_id
+            assert goal.world_id in (0, state.world_id)
 
     def teardown(self) -> None:
         self.follow(self.tracker.end(Verdict('SHUTDOWN', ''), self.now), 'SHUTDOWN')

@@ -65,7 +65,7 @@ def test_out_of_order_state(rig: FaultRig) -> None:
 def test_states_of_a_restarted_simulator_are_taken(rig: FaultRig) -> None:
     rig._step = -1
     rig.drive()
-    assert rig.node._session._order._newest < (1, 100)
+    assert rig.node._session._order.now < (0, 1, 100)
 
 
 def test_publisher_of_states_vanishes_and_comes_back(rig: FaultRig) -> None:

@@ -76,6 +76,31 @@ def test_lockstep_ignores_actions_for_other_states(graph: Graph) -> None:
     assert (states[-1].step, len(states)) == (1, 2)
 
 
+def test_lockstep_state_is_repeated_for_a_partner_that_joins_late(graph: Graph) -> None:
+    graph.add(SimBridgeNode, stepping='lockstep')
+    states = graph.collect(MazeState, 'state', ANY)  # which gets nothing from before
+    graph.wait(lambda: len(states) >= 3, 'repetitions', timeout_s=15)
+    assert {state.step for state in states} == {0}
+    graph.publish('action', answer(states[-1], (0.0, 0.0), world_id=states[-1].world_id))
+    graph.wait(lambda: states[-1].step == 1, 'the next state')
+
+
+def test_every_simulator_draws_its_world_and_ignores_actions_for_others(graph: Graph) -> None:
+    first = graph.add(SimBridgeNode, stepping='lockstep')
+    states = Record(graph, EVERY).states
+    old = graph.wait(lambda: states, 'the first state')[0]
+    graph.remove(first)
+    graph.add(SimBridgeNode, stepping='lockstep')
+    new = graph.wait(lambda: states[-1].world_id != old.world_id and states[-1], 'a new world')
+    assert (new.episode_id, new.step, 0 in (new.world_id, old.world_id)) == (1, 0, False)
+    assert graph.set_task(1).world_id == new.world_id
+    graph.wait(lambda: states[-1].episode_id == 2, 'the task')
+    graph.publish('action', answer(states[-1], world_id=old.world_id))
+    graph.publish('action', answer(states[-1], (0.0, 0.0), world_id=new.world_id))
+    graph.wait(lambda: states[-1].step == 1, 'the step')
+    assert abs(states[-1].position.x) < 0.2
+
+
 def test_set_task_announces_the_goal(graph: Graph) -> None:
     graph.add(SimBridgeNode, stepping='lockstep')
     record = Record(graph, EVERY)

@@ -1,6 +1,6 @@
 import math
 
-from metagcttt.visualization.messages import markers, odometry, path, thinned
+from metagcttt.visualization.messages import markers, odometry, path, segments_fault, thinned
 import numpy as np
 import pytest
 from std_msgs.msg import Header
@@ -43,10 +43,28 @@ def test_markers_without_a_goal_delete_what_was_shown() -> None:
 
 
 def test_thinning_keeps_the_ends_and_the_bound() -> None:
-    long = np.stack([np.arange(1000.0), np.zeros(1000)], axis=1)
-    short = long[:3]
-    found = thinned([long, short, long[:1]], max_points=100)
+    starts, stops = np.array([0, 1000, 2000]), np.array([1000, 1003, 2001])
+    found = thinned(starts, stops, max_points=100)
     assert len(found) == 2
-    assert sum(len(segment) for segment in found) <= 110
-    assert (found[0][0, 0], found[0][-1, 0], found[1][-1, 0]) == (0, 999, 2)
-    assert len(thinned([short], max_points=100)[0]) == 3
+    assert sum(len(rows) for rows in found) <= 110
+    assert (found[0][0], found[0][-1], found[1][-1]) == (0, 999, 1002)
+    assert thinned(starts[1:2], stops[1:2], max_points=100)[0].tolist() == [1000, 1001, 1002]
+    many = np.arange(0, 10**6, 2)
+    assert sum(len(rows) for rows in thinned(many, many + 2, max_points=100)) == 100
+
+
+@pytest.mark.parametrize(
+    ('starts', 'stops', 'fault'),
+    [
+        ([], [], ''),
+        ([5, 0], [9, 5], ''),
+        ([0], [], 'it has 1 starts and 0 stops of sub-trajectories'),
+        ([0], [11], 'a sub-trajectory is empty or not within the 10 rows of the dataset'),
+        ([3], [3], 'a sub-trajectory is empty or not within the 10 rows of the dataset'),
+        ([0, 4], [5, 9], 'its sub-trajectories overlap'),
+        ([0] * 10**6, [10] * 10**6, 'its sub-trajectories overlap'),
+    ],
+)
+def test_ranges_of_a_report_are_checked_before_rows_are_read(starts, stops, fault: str) -> None:
+    found = segments_fault(np.array(starts, np.uint32), np.array(stops, np.uint32), 10)
+    assert found == fault

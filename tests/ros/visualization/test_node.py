@@ -1,4 +1,5 @@
 from pathlib import Path
+import tracemalloc
 
 from ament_index_python import get_package_share_directory
 from geometry_msgs.msg import Point
@@ -49,6 +50,19 @@ def test_odometry_follows_every_state(graph: Graph, checkpoint_folder, dataset_f
     assert last.pose.pose.position.x == 1.0
     assert last.twist.twist.linear.x == pytest.approx(5.0)
     assert (last.header.frame_id, last.child_frame_id) == ('map', 'base_link')
+
+
+def test_report_on_a_million_ranges_is_ignored(
+    graph: Graph, checkpoint_folder, dataset_file
+) -> None:
+    files = {'checkpoint': str(checkpoint_folder), 'dataset': str(dataset_file)}
+    node = graph.add(VisualizationNode, **files)
+    tracemalloc.start()
+    node._on_report(AdaptationReport(segment_starts=[0] * 10**6, segment_stops=[2640] * 10**6))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert node._segments == []
+    assert peak < 2e8  # of 20 GB
 
 
 def test_path_is_bounded_and_starts_anew_with_the_episode(

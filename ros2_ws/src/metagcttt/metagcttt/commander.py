@@ -93,7 +93,8 @@ class RobotCommander(Node):
         self._set_task = self.create_client(SetTask, 'set_task')
         self._reset = self.create_client(Trigger, 'reset')
         self._enable = self.create_client(SetBool, 'enable')
-        self._episode_id = 0  # started by this commander; the goal node may not know it yet
+        # Started by this commander; the goal node may not know it yet.
+        self._episode_id = self._world_id = 0
         self._verdicts: dict[str, EpisodeEvent | None] = {}  # to goals being sent
         self._verdicts_from = self.create_subscription(
             EpisodeEvent, 'episode', self._on_event, EVENTS
@@ -137,7 +138,10 @@ class RobotCommander(Node):
         """
         values = to_floats(goal)
         request = ReachGoal.Goal(
-            max_steps=max_steps, episode_id=self._episode_id, request_id=uuid.uuid4().hex
+            max_steps=max_steps,
+            episode_id=self._episode_id,
+            world_id=self._world_id,
+            request_id=uuid.uuid4().hex,
         )
         request.pose = PoseStamped()
         request.pose.header.frame_id = self._frame_id
@@ -171,8 +175,11 @@ class RobotCommander(Node):
         return sent
 
     def _on_event(self, message: EpisodeEvent) -> None:
-        if message.kind == EpisodeEvent.STARTED and message.episode_id != self._episode_id:
-            self._episode_id = 0  # started by another node
+        episode = (self._world_id, self._episode_id)
+        if message.kind == EpisodeEvent.STARTED and (
+            (message.world_id, message.episode_id) != episode
+        ):
+            self._episode_id = self._world_id = 0  # started by another node
         is_answer = message.kind in (EpisodeEvent.GOAL_ACCEPTED, EpisodeEvent.GOAL_REJECTED)
         if is_answer and message.request_id in self._verdicts:
             self._verdicts[message.request_id] = message
@@ -186,12 +193,12 @@ class RobotCommander(Node):
         request = SetTask.Request(task_id=task_id, seed=seed, send_goal=send_goal)
         response = self._call(self._set_task, request, timeout_s)
         if response.success:
-            self._episode_id = response.episode_id
+            self._episode_id, self._world_id = response.episode_id, response.world_id
         return response
 
     def reset(self, timeout_s: float = 10.0) -> Trigger.Response:
         """Start an episode without a task, at a random position."""
-        self._episode_id = 0
+        self._episode_id = self._world_id = 0
         return self._call(self._reset, Trigger.Request(), timeout_s)
 
     def enable(self, enabled: bool, timeout_s: float = 10.0) -> SetBool.Response:

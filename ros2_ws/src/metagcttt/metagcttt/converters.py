@@ -52,6 +52,7 @@ def state_message(
     terminated: bool,
     truncated: bool,
     success: bool,
+    world_id: int = 0,
 ) -> MazeState:
     """The state after a control step."""
     return MazeState(
@@ -63,6 +64,7 @@ def state_message(
         terminated=bool(terminated),
         truncated=bool(truncated),
         success=bool(success),
+        world_id=world_id,
     )
 
 
@@ -75,6 +77,7 @@ def action_message(
     values: ArrayLike,
     adapted: bool,
     instance: int = 0,
+    world_id: int = 0,
 ) -> ActionCommand:
     """The action for a state."""
     return ActionCommand(
@@ -85,6 +88,7 @@ def action_message(
         values=to_floats(values),
         adapted=bool(adapted),
         instance=instance,
+        world_id=world_id,
     )
 
 
@@ -99,6 +103,7 @@ def goal_message(header: Header, goal: Goal, *, active: bool, lease_s: float = 0
         position=to_point(goal.xy),
         seed=goal.seed,
         lease_s=lease_s,
+        world_id=goal.world_id,
     )
 
 
@@ -110,6 +115,7 @@ def to_goal(message: GoalQuery) -> Goal:
         observation=to_array(message.goal),
         xy=(message.position.x, message.position.y),
         seed=message.seed,
+        world_id=message.world_id,
     )
 
 

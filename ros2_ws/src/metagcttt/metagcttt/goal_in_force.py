@@ -16,6 +16,7 @@ class Goal:
         observation: Full goal observation, shape (obs_dim,), float64.
         xy: Its position in metres.
         seed: Random seed of the adaptation to it.
+        world_id: The only world in which it counts; 0 when its states name none.
     """
 
     query_id: int
@@ -23,3 +24,4 @@ class Goal:
     observation: NDArray[np.float64]
     xy: tuple[float, float]
     seed: int
+    world_id: int = 0

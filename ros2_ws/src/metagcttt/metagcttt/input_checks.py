@@ -1,9 +1,8 @@
-"""Checks of incoming messages: vectors, the order of states, the number of senders."""
+"""Checks of incoming messages: vectors and the number of senders."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-RESTART_STATES = 3
 SENDER_TIMEOUT_S = 1.0
 
 
@@ -19,40 +18,6 @@ def vector_fault(name: str, values: NDArray[np.float64], size: int) -> str:
     if not finite:
         return f'{name} is not finite: {values.tolist()}'
     return ''
-
-
-class StateOrder:
-    """Refuses states older than the newest one, unless their source has restarted.
-
-    A restarted simulator counts from 1 again. Its states differ from stray ones in that they
-    follow one another: the third in a row is accepted.
-    """
-
-    def __init__(self) -> None:
-        """Accept any first state."""
-        self._newest: tuple[int, int] | None = None
-        self._older: tuple[int, int] | None = None
-        self._num_older = 0
-
-    def refusal(self, episode_id: int, step: int) -> str:
-        """The reason why a state is out of order; empty when it is accepted, as repeats are."""
-        number = (episode_id, step)
-        if self._newest is None or number >= self._newest:
-            return self._accept(number)
-        follows = self._older is not None and number > self._older
-        self._num_older = self._num_older + 1 if follows else 1
-        self._older = number
-        if self._num_older >= RESTART_STATES:
-            return self._accept(number)
-        newest_episode, newest_step = self._newest
-        return (
-            f'state {step} of episode {episode_id} came after state {newest_step} of episode '
-            f'{newest_episode}'
-        )
-
-    def _accept(self, number: tuple[int, int]) -> str:
-        self._newest, self._older, self._num_older = number, None, 0
-        return ''
 
 
 class Senders:

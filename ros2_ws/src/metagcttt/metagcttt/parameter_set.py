@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+import math
 from typing import Any, Literal
 
 from rcl_interfaces.msg import (
@@ -72,6 +73,8 @@ class Parameter:
         """The reason to reject `value`, beyond the descriptor's; empty to accept it."""
         if self.choices and value not in self.choices:
             return f'{self.name} must be {self.accepted()}, got {value!r}'
+        if isinstance(value, float) and math.isnan(value):  # which no range excludes
+            return f'{self.name} must be {self.accepted()}, got nan'
         return ''
 
 

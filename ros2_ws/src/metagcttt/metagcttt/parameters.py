@@ -54,6 +54,14 @@ GOAL_NODE = (
         changes='now',
     ),
     Parameter(
+        'partner_timeout_s',
+        10.0,
+        'lockstep: a goal ends after this long without a step and without a policy status, '
+        'seconds',
+        (0.1, 3600),
+        changes='now',
+    ),
+    Parameter(
         'goal_lease_s',
         2.0,
         'the policy drops a goal that this node has not repeated for this long, seconds; 0: never',

@@ -7,11 +7,11 @@ from typing import TypeVar
 
 import rclpy
 from rclpy.exceptions import ParameterException
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from metagcttt.guard import GuardedExecutor
 from metagcttt.signals import ignore_signals, only_set
 
 FAREWELL_S = 0.3
@@ -55,7 +55,7 @@ def run(
 def _spin(
     node: AnyNode, stop: threading.Event, farewell: Callable[[AnyNode], None] | None
 ) -> None:
-    executor = SingleThreadedExecutor()
+    executor = GuardedExecutor()
     executor.add_node(node)
     try:
         while not stop.is_set():

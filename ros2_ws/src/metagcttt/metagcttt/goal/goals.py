@@ -11,6 +11,7 @@ from sim_bridge import MazeDescription
 
 from metagcttt.goal_in_force import Goal
 from metagcttt.input_checks import vector_fault
+from metagcttt.worlds import Moment
 
 Error = Literal[
     'NONE',
@@ -28,6 +29,7 @@ Error = Literal[
     'NEW_EPISODE',
     'STATE_LOST',
     'SHUTDOWN',
+    'POLICY_LOST',
 ]
 """The names of the error codes of ReachGoal's result."""
 
@@ -52,7 +54,7 @@ class AcceptedGoal(Goal):
         accepted_s: Time of acceptance, seconds of the goal node's clock.
     """
 
-    first_step: int
+    first_step: int = 0
     is_task: bool = False
     max_steps: int = 0
     request_id: str = ''
@@ -69,6 +71,7 @@ class RobotState:
         xy: The robot's position in metres.
         ended: Whether the episode ended with this state.
         success: Whether the robot is at the goal of the episode's task, as the simulator judges.
+        world_id: Its world; 0 when it names none.
     """
 
     episode_id: int
@@ -76,6 +79,12 @@ class RobotState:
     xy: tuple[float, float]
     ended: bool = False
     success: bool = False
+    world_id: int = 0
+
+    @property
+    def moment(self) -> Moment:
+        """Its place in time."""
+        return Moment(self.world_id, self.episode_id, self.step)
 
 
 class GoalCatalog:

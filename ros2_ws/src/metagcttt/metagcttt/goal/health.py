@@ -28,6 +28,10 @@ class GoalMonitor:
         if fault:
             self._faults.note('unusable_states', fault, now_s)
 
+    def ignored(self, reason: str) -> None:
+        """Record a state or the start of an episode that is not of the present."""
+        self._faults.note('out_of_order', reason, time.monotonic())
+
     def saw_policy(self) -> None:
         """Record a status message of the policy."""
         self._policy_s = time.monotonic()

@@ -10,17 +10,17 @@ from metagcttt_core.config.assets import dataset_path
 from metagcttt_interfaces.action import ReachGoal
 from metagcttt_interfaces.msg import EpisodeEvent, MazeState, PolicyStatus
 import numpy as np
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sim_bridge import describe_environment
 
+from metagcttt.clocks import JumpFreeClock, STEADY
 from metagcttt.converters import to_array
 from metagcttt.diagnostics import Diagnostics
 from metagcttt.goal.goals import GoalCatalog, RobotState, Verdict
 from metagcttt.goal.health import GoalMonitor
 from metagcttt.goal.publishers import GoalPublishers
 from metagcttt.goal.reach_goal_server import feedback_message, ReachGoalServer
-from metagcttt.goal.tracker import Change, Ended, GoalRequest, GoalTracker, Now, Rejected
+from metagcttt.goal.tracker import Change, Ended, GoalRequest, GoalTracker, Ignored, Now, Rejected
 from metagcttt.health import Health
 from metagcttt.input_checks import vector_fault
 from metagcttt.parameter_set import ParameterSet
@@ -33,6 +33,7 @@ from metagcttt.qos import (
     RECORDED_DEPTH,
     state_profile,
 )
+from metagcttt.worlds import Moment
 
 WATCHDOG_PERIOD_S = 0.1
 
@@ -54,6 +55,7 @@ class GoalNode(Node):
         self._settings = ParameterSet(self, GOAL_NODE, is_configured=lambda: True)
         description = describe_environment(self._settings['environment'])
         self._spec = description.spec
+        self._clock_without_jumps = JumpFreeClock(self)
         dataset = TrajectoryDataset.load(dataset_path(self._settings['dataset']))
         self._tracker = GoalTracker(
             GoalCatalog(description, TrajectoryFilter(dataset)),
@@ -91,8 +93,7 @@ class GoalNode(Node):
             ),
             cancel=lambda: self._end(Verdict('CANCELED', 'canceled')),
         )
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(WATCHDOG_PERIOD_S, self._on_watchdog, clock=steady)
+        self.create_timer(WATCHDOG_PERIOD_S, self._on_watchdog, clock=STEADY)
         self._diagnostics = Diagnostics(
             self, self._examine, self._settings['diagnostics_period_s']
         )
@@ -105,6 +106,7 @@ class GoalNode(Node):
     def destroy_node(self) -> None:
         """Destroy the action server, then the node."""
         self._reach_goal.destroy()
+        self._clock_without_jumps.close()
         super().destroy_node()
 
     # --- input -------------------------------------------------------------------------------
@@ -119,6 +121,7 @@ class GoalNode(Node):
             episode_id=message.episode_id,
             max_steps=message.max_steps,
             request_id=message.request_id,
+            world_id=message.world_id,
         )
 
     def _refusal(self, message: ReachGoal.Goal) -> Verdict | None:
@@ -143,19 +146,17 @@ class GoalNode(Node):
                 observation=to_array(message.goal),
                 episode_id=message.episode_id,
                 is_task=True,
+                world_id=message.world_id,
             )
+        start = Moment(message.world_id, message.episode_id)
         published_ns = info['source_timestamp']
-        self._publish(
-            self._tracker.on_episode(message.episode_id, published_ns, self._now(), task)
-        )
+        self._publish(self._tracker.on_episode(start, published_ns, self._now(), task))
 
     def _on_state(self, message: MazeState, info: dict[str, int]) -> None:
         xy = (message.position.x, message.position.y)
-        fault = (
-            vector_fault('the state', to_array(message.observation), self._spec.obs_dim)
-            or vector_fault("the state's position", np.array(xy), 2)
-            or self._tracker.order_fault(message.episode_id, message.step)
-        )
+        fault = vector_fault(
+            'the state', to_array(message.observation), self._spec.obs_dim
+        ) or vector_fault("the state's position", np.array(xy), 2)
         self._monitor.saw_state(fault)
         if fault:
             return
@@ -165,6 +166,7 @@ class GoalNode(Node):
             xy=xy,
             ended=message.terminated or message.truncated,
             success=message.success,
+            world_id=message.world_id,
         )
         self._publish(
             self._tracker.on_state(
@@ -180,6 +182,7 @@ class GoalNode(Node):
     def _on_policy(self, message: PolicyStatus) -> None:
         self._policy = message
         self._monitor.saw_policy()
+        self._tracker.on_partner(self._now())
         self._send_feedback()
 
     def _on_watchdog(self) -> None:
@@ -192,16 +195,19 @@ class GoalNode(Node):
                 now,
                 has_source=bool(self.count_publishers('state')),
                 timeout_s=self._settings['state_timeout_s'],
+                partner_timeout_s=self._settings['partner_timeout_s'],
             )
         )
 
     def _now(self) -> Now:
-        return Now(time.monotonic(), self.get_clock().now().nanoseconds / 1e9)
+        return Now(time.monotonic(), self._clock_without_jumps.now_s())
 
     # --- output ------------------------------------------------------------------------------
 
     def _publish(self, changes: Iterable[Change]) -> None:
         for change in changes:
+            if isinstance(change, Ignored):
+                self._monitor.ignored(change.reason)
             self._goal_publishers.publish(change, self._settings['goal_lease_s'])
             if isinstance(change, Ended | Rejected):
                 self._monitor.counts[change.verdict.error] += 1

@@ -9,7 +9,14 @@ from std_msgs.msg import Header
 
 from metagcttt.converters import goal_message, to_point
 from metagcttt.goal.goals import AcceptedGoal, Verdict
-from metagcttt.goal.tracker import Accepted, Change, Ended, GoalRequest, Rejected
+from metagcttt.goal.tracker import (
+    Accepted,
+    Change,
+    Ended,
+    GoalRequest,
+    MAX_REQUEST_ID,
+    Rejected,
+)
 from metagcttt.goal_in_force import Goal
 from metagcttt.qos import EVENTS, LATCHED
 
@@ -56,9 +63,9 @@ class GoalPublishers:
                     self._set_goal(goal, active=False)
                 kind, what = ENDINGS.get(verdict.error, ENDED)
                 self._announce(what, goal, verdict, kind=kind, step=step)
-            case Rejected(request, verdict, episode_id, step):
-                fields = {'kind': EpisodeEvent.GOAL_REJECTED, 'step': step}
-                self._announce('rejected', request, verdict, episode_id=episode_id, **fields)
+            case Rejected(request, verdict, moment):
+                fields = {'kind': EpisodeEvent.GOAL_REJECTED, **moment._asdict()}
+                self._announce('rejected', request, verdict, **fields)
 
     def repeat_goal(self, now_s: float) -> None:
         """Publish the newest goal again, unchanged, when that is due."""
@@ -81,12 +88,13 @@ class GoalPublishers:
         if isinstance(goal, AcceptedGoal):
             name = f'goal {goal.query_id}'
             fields |= {'query_id': goal.query_id, 'episode_id': goal.episode_id}
+            fields['world_id'] = goal.world_id
         self._events.publish(
             EpisodeEvent(
                 header=self._header(),
                 reason=verdict.reason,
                 error_code=getattr(ReachGoal.Result, verdict.error),
-                request_id=goal.request_id,
+                request_id=goal.request_id[:MAX_REQUEST_ID],
                 position=to_point(goal.xy),
                 **fields,
             )

@@ -20,6 +20,7 @@ class State:
         observation: Shape (obs_dim,), float64, unless there is a fault.
         ended: The episode is over, so no action follows.
         fault: Why no action can be computed from it; empty when one can.
+        world_id: Its world; 0 when it names none.
     """
 
     episode_id: int
@@ -27,6 +28,7 @@ class State:
     observation: NDArray[np.float64]
     ended: bool
     fault: str = ''
+    world_id: int = 0
 
 
 @dataclass
@@ -64,7 +66,12 @@ class Pursuit:
 
     def serves(self, state: State) -> bool:
         """True when the goal counts in `state`."""
-        return state.episode_id == self.goal.episode_id and not state.ended
+        return self.is_for(state) and not state.ended
+
+    def is_for(self, state: State) -> bool:
+        """True when `state` is of the goal's episode and world."""
+        same_world = self.goal.world_id in (0, state.world_id)
+        return same_world and state.episode_id == self.goal.episode_id
 
     def needs_adaptation(self, state: State) -> bool:
         """True when an adaptation is due: the first, or `horizon` steps after the last."""
@@ -76,6 +83,8 @@ class Pursuit:
 
     def idle_reason(self, state: State) -> str:
         """The reason why `state` gets no action towards the goal; empty when it gets one."""
+        if not self.is_for(state) and state.episode_id == self.goal.episode_id:
+            return f'the goal is for world {self.goal.world_id:x}, not {state.world_id:x}'
         if state.episode_id != self.goal.episode_id:
             return f'the goal is for episode {self.goal.episode_id}, not {state.episode_id}'
         if state.ended:

@@ -86,6 +86,7 @@ class PolicyPublishers:
                 values=command.values,
                 adapted=command.adapted,
                 instance=self._instance,
+                world_id=state.world_id,
             )
         )
 

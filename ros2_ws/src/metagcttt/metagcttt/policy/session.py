@@ -4,13 +4,13 @@ import time
 
 from metagcttt_core import Adaptation, TTTConfig
 from metagcttt_interfaces.msg import GoalQuery, MazeState, PolicyStatus
-from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode
 from rclpy.timer import Timer
 
+from metagcttt.clocks import JumpFreeClock, STEADY
 from metagcttt.converters import to_array, to_goal
 from metagcttt.health import Health
-from metagcttt.input_checks import StateOrder, vector_fault
+from metagcttt.input_checks import vector_fault
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.policy.adapter import GoalAdapter
 from metagcttt.policy.decision import decide, Pursuit, State
@@ -19,6 +19,7 @@ from metagcttt.policy.health import PolicyMonitor
 from metagcttt.policy.publishers import PolicyPublishers
 from metagcttt.policy.safety import Safety
 from metagcttt.qos import LATCHED, state_profile
+from metagcttt.worlds import Moment, RESTART_STATES, WorldOrder
 
 WARNING_PERIOD_S = 5.0
 WATCHDOG_PERIOD_S = 0.1
@@ -65,15 +66,16 @@ class PolicySession:
         self._state: State | None = None
         self._received_ns = 0  # arrival of the newest state; 0 once answered
         self._answered = True  # lockstep: whether the newest state got its action
-        self._order = StateOrder()
+        # In lockstep, states are delivered in order, and one that begins again has no successor.
+        self._order = WorldOrder(1 if self._lockstep else RESTART_STATES)
+        self._clock = JumpFreeClock(node)
         self._monitor = PolicyMonitor()
         self._safety = Safety(enabled=enabled)
         self._publishers = PolicyPublishers(node, instance)
         self._adapter = GoalAdapter(
             node, settings, deployment, self._publishers, self._monitor, self._proceed
         )
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._watchdog = node.create_timer(WATCHDOG_PERIOD_S, self._on_watchdog, clock=steady)
+        self._watchdog = node.create_timer(WATCHDOG_PERIOD_S, self._on_watchdog, clock=STEADY)
         profile = state_profile(settings['stepping'])
         self._inputs = (
             node.create_subscription(
@@ -113,6 +115,7 @@ class PolicySession:
         self._acting = False
         self._stop_timer()
         self._adapter.close()
+        self._clock.close()
         for subscription in self._inputs:
             self._node.destroy_subscription(subscription)
         self._node.destroy_timer(self._watchdog)
@@ -136,15 +139,17 @@ class PolicySession:
     def _on_state(self, message: MazeState, info: dict[str, int]) -> None:
         now_s = time.monotonic()
         self._monitor.states.add(now_s)
-        out_of_order = ''
-        if not self._lockstep:  # where an action names the state it answers
-            out_of_order = self._order.refusal(message.episode_id, message.step)
+        out_of_order = self._order.refuse_state(
+            Moment(message.world_id, message.episode_id, message.step), info['source_timestamp']
+        )
         observation = to_array(message.observation)
         fault = vector_fault('the state', observation, self.deployment.agent.obs_dim)
         if out_of_order:
             self._monitor.faults.note('states_out_of_order', out_of_order, now_s)
         elif fault:
             self._monitor.faults.note('malformed_states', fault, now_s)
+        if out_of_order and self._lockstep:
+            return  # the simulator waits for the answer to another state
         # The simulator takes actions for its current episode only.
         if not out_of_order or self._state is None:
             self._state = State(
@@ -153,8 +158,9 @@ class PolicySession:
                 observation=observation,
                 ended=message.terminated or message.truncated,
                 fault=fault,
+                world_id=message.world_id,
             )
-        self._safety.saw_state(now_s, self._clock_s(), out_of_order)
+        self._safety.saw_state(now_s, self._clock.now_s(), out_of_order)
         self._received_ns = info['received_timestamp']
         self._answered = False
         pursuit = self._pursuit
@@ -235,15 +241,12 @@ class PolicySession:
     def _on_tick(self) -> None:
         self._publish_action(self._pursuit)
 
-    def _clock_s(self) -> float:
-        return self._node.get_clock().now().nanoseconds / 1e9
-
     def _zero_reason(self) -> str:
         """The reason why the robot may not move now; empty when it may."""
         return self._safety.zero_reason(
             self._state,
             now_s=time.monotonic(),
-            clock_s=self._clock_s(),
+            clock_s=self._clock.now_s(),
             timeout_s=float('inf') if self._lockstep else self._settings['state_timeout_s'],
         )
 

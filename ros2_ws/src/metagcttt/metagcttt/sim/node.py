@@ -1,6 +1,7 @@
 """The simulator bridge node."""
 
 import math
+import secrets
 import time
 from typing import Any
 
@@ -9,7 +10,6 @@ from metagcttt_interfaces.srv import SetTask
 from nav_msgs.msg import OccupancyGrid
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.timer import Timer
@@ -18,6 +18,7 @@ from sim_bridge import make_simulator, StepResult
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
+from metagcttt.clocks import STEADY
 from metagcttt.converters import (
     occupancy_grid,
     state_message,
@@ -43,6 +44,7 @@ from metagcttt.sim.health import SimMonitor
 from metagcttt.sim.pacing import Pacer
 
 HEARTBEAT_S = 0.1
+LOCKSTEP_HEARTBEAT_S = 1.0
 
 
 class SimBridgeNode(Node):
@@ -53,7 +55,9 @@ class SimBridgeNode(Node):
     than one node sends actions, it applies zero instead. After the end of a task episode, or while
     paused, nothing moves until the next reset or except by the service `step`. In realtime the
     last state is repeated while paused or stepping slowly, so that the simulator is not taken for
-    dead.
+    dead. In lockstep it is repeated too, once a second, for a partner that lost it or joined late.
+
+    Every state names the world: a number drawn at random when the node starts.
 
     The header of a state carries simulated time, which starts at 0 with the node and never goes
     back; `/clock` carries the same.
@@ -78,6 +82,7 @@ class SimBridgeNode(Node):
         self._lockstep = self._settings['stepping'] == 'lockstep'
         self._period_ns = round(spec.control_period_s * 1e9)
         self._time_ns = 0
+        self._world_id = secrets.randbits(64) or 1  # 0 stands for none
         self._episode_id = 0
         self._step = 0
         self._last = StepResult(np.zeros(spec.obs_dim), False, False, False)
@@ -109,8 +114,8 @@ class SimBridgeNode(Node):
             f'{spec.name}, {self._settings["stepping"]}: observations of {spec.obs_dim}, '
             f'actions of {spec.act_dim} values, {spec.num_tasks} tasks'
         )
-        self._begin(self._simulator.reset_free(self._settings['seed']), self._settings['seed'])
         self._timer: Timer | None = None
+        self._begin(self._simulator.reset_free(self._settings['seed']), self._settings['seed'])
         self._beats_per_step = 1
         self._pacer = Pacer(spec.control_period_s, time.monotonic())
         self._pace()
@@ -121,11 +126,14 @@ class SimBridgeNode(Node):
         super().destroy_node()
 
     def _pace(self) -> None:
-        """(Re)start the realtime timer and the count of its steps."""
-        if self._lockstep:
-            return
+        """(Re)start the timer: of the steps and their count in realtime, else of the heartbeat."""
         if self._timer is not None:
             self.destroy_timer(self._timer)
+        if self._lockstep:
+            self._timer = self.create_timer(
+                LOCKSTEP_HEARTBEAT_S, self._publish_state, clock=STEADY
+            )
+            return
         period_s = self._simulator.spec.control_period_s / self._settings['speed_factor']
         self._pacer = Pacer(period_s, time.monotonic())
         self._beats_per_step = math.ceil(period_s / HEARTBEAT_S)
@@ -133,7 +141,7 @@ class SimBridgeNode(Node):
         self._timer = self.create_timer(
             period_s / self._beats_per_step,
             self._on_tick,
-            clock=Clock(clock_type=ClockType.STEADY_TIME),
+            clock=STEADY,
         )
 
     def _on_parameters_set(self, parameters: list[Parameter]) -> None:
@@ -174,6 +182,8 @@ class SimBridgeNode(Node):
         self._publish_state()
 
     def _on_action(self, message: ActionCommand) -> None:
+        if message.world_id not in (0, self._world_id):
+            return  # for another simulator, or the one before this
         if message.episode_id != self._episode_id:
             return  # for an episode that is over
         if self._lockstep and message.step != self._step:
@@ -248,6 +258,7 @@ class SimBridgeNode(Node):
         response.success = True
         response.message = f'episode {self._episode_id} began, task {request.task_id}'
         response.episode_id = self._episode_id
+        response.world_id = self._world_id
         response.observation = to_floats(observation)
         response.goal = to_floats(goal)
         response.goal_position = to_point(goal[list(self._simulator.spec.position_dims)])
@@ -272,6 +283,7 @@ class SimBridgeNode(Node):
                 position=to_point(self._simulator.position),
                 goal=to_floats(() if goal is None else goal),
                 seed=seed,
+                world_id=self._world_id,
             )
         )
         self._publish_state()
@@ -290,6 +302,8 @@ class SimBridgeNode(Node):
 
     def _publish_state(self) -> None:
         self._monitor.states.add(time.monotonic())
+        if self._lockstep and self._timer is not None:
+            self._timer.reset()
         if self._clock_messages is not None:
             self._clock_messages.publish(ClockMessage(clock=to_time(self._time_ns)))
         self._states.publish(
@@ -302,5 +316,6 @@ class SimBridgeNode(Node):
                 terminated=self._last.terminated,
                 truncated=self._last.truncated,
                 success=self._last.success,
+                world_id=self._world_id,
             )
         )

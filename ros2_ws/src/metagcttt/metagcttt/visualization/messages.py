@@ -105,16 +105,34 @@ def _marker(
     return marker
 
 
-def thinned(
-    segments: Sequence[NDArray[np.floating]], max_points: int
-) -> list[NDArray[np.floating]]:
-    """Sub-trajectories thinned to about `max_points` in total.
+def segments_fault(starts: NDArray[np.integer], stops: NDArray[np.integer], num_rows: int) -> str:
+    """The reason why these are not disjoint ranges of a dataset's rows; empty when they are.
 
-    The last point of each is kept. Those of a single point, which have no line, are dropped.
+    Args:
+        starts: First row of each range, shape (n,).
+        stops: Row after its last one, shape (m,), with m = n in a sound report.
+        num_rows: Rows of the dataset.
     """
-    stride = max(1, math.ceil(sum(len(segment) for segment in segments) / max_points))
-    return [
-        np.concatenate([segment[:-1:stride], segment[-1:]])
-        for segment in segments
-        if len(segment) > 1
-    ]
+    if starts.shape != stops.shape:
+        return f'it has {starts.size} starts and {stops.size} stops of sub-trajectories'
+    order = np.argsort(starts)
+    edges = np.stack([starts[order], stops[order]], axis=1).astype(np.int64).ravel()
+    # Also a bound: disjoint ranges have no more rows than the dataset.
+    if edges.size and (edges[-1] > num_rows or (np.diff(edges)[::2] < 1).any()):
+        return f'a sub-trajectory is empty or not within the {num_rows} rows of the dataset'
+    if (np.diff(edges) < 0).any():
+        return 'its sub-trajectories overlap'
+    return ''
+
+
+def thinned(
+    starts: NDArray[np.integer], stops: NDArray[np.integer], max_points: int
+) -> list[NDArray[np.integer]]:
+    """Row numbers of sub-trajectories, thinned to about `max_points` in total.
+
+    The last row of each is kept. Those of a single row, which have no line, are dropped, and so
+    are the last ones where even two rows of each would be too many.
+    """
+    stride = max(1, math.ceil(int(np.sum(stops - starts)) / max_points))
+    long = [(a, b) for a, b in zip(starts, stops, strict=True) if b - a > 1]
+    return [np.append(np.arange(a, b - 1, stride), b - 1) for a, b in long[: max_points // 2]]

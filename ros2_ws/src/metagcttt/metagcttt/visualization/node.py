@@ -10,17 +10,23 @@ from metagcttt_interfaces.msg import AdaptationReport, GoalQuery, MazeState
 from nav_msgs.msg import Odometry, Path
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sim_bridge import describe_environment
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
+from metagcttt.clocks import STEADY
 from metagcttt.converters import to_array
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import VISUALIZATION_NODE
 from metagcttt.qos import COMMAND, EVENTS, LATCHED, SENSOR
-from metagcttt.visualization.messages import markers, odometry, path, thinned
+from metagcttt.visualization.messages import (
+    markers,
+    odometry,
+    path,
+    segments_fault,
+    thinned,
+)
 
 SPACING_M = 0.1
 
@@ -58,9 +64,7 @@ class VisualizationNode(Node):
         self.create_subscription(MazeState, 'state', self._on_state, SENSOR)
         self.create_subscription(GoalQuery, 'goal', self._on_goal, LATCHED)
         self.create_subscription(AdaptationReport, 'adaptation', self._on_report, EVENTS)
-        # Not the node's clock, which stops while the simulation is paused.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(1.0 / self._settings['rate_hz'], self._publish, clock=steady)
+        self.create_timer(1.0 / self._settings['rate_hz'], self._publish, clock=STEADY)
 
     def _on_state(self, message: MazeState) -> None:
         xy = (message.position.x, message.position.y)
@@ -68,7 +72,7 @@ class VisualizationNode(Node):
             return
         speed = 0.0
         last, self._state = self._state, message
-        if last is None or last.episode_id != message.episode_id:
+        if last is None or _episode(last) != _episode(message):
             self._positions.clear()
         else:
             dx, dy = xy[0] - last.position.x, xy[1] - last.position.y
@@ -91,10 +95,14 @@ class VisualizationNode(Node):
         self._markers_changed = True
 
     def _on_report(self, message: AdaptationReport) -> None:
-        rows = zip(message.segment_starts, message.segment_stops, strict=False)
+        starts, stops = np.array(message.segment_starts), np.array(message.segment_stops)
+        fault = segments_fault(starts, stops, len(self._dataset.observations))
+        if fault:
+            self.get_logger().warning(f'a report is ignored: {fault}', throttle_duration_sec=5.0)
+            return
         dims = list(self._spec.position_dims)
-        found = [self._dataset.observations[start:stop, dims] for start, stop in rows]
-        self._segments = thinned(found, self._settings['marker_points'])
+        rows = thinned(starts, stops, self._settings['marker_points'])
+        self._segments = [self._dataset.observations[some[:, None], dims] for some in rows]
         self._markers_changed = True
 
     def _publish(self) -> None:
@@ -109,7 +117,7 @@ class VisualizationNode(Node):
 
     def _publish_markers(self, state: MazeState) -> None:
         goal = self._goal
-        active = goal is not None and goal.active and goal.episode_id == state.episode_id
+        active = goal is not None and goal.active and _episode(goal) == _episode(state)
         self._markers.publish(
             markers(
                 state.header,
@@ -127,6 +135,10 @@ class VisualizationNode(Node):
         if self._value_fn is None or observation.shape != size or target.shape != size:
             return None
         return float(self._value_fn(observation[None].astype(np.float32), target)[0])
+
+
+def _episode(message: MazeState | GoalQuery) -> tuple[int, int]:
+    return message.world_id, message.episode_id
 
 
 def _seconds(header: Header) -> float:
