@@ -2,6 +2,7 @@
 
 from functools import partial
 from pathlib import Path
+import secrets
 import time
 from typing import Any
 
@@ -48,6 +49,7 @@ class RobotBridgeNode(Node):
             ContractError: If the contract is wrong or its message types do not have its fields.
         """
         super().__init__('robot_bridge_node', **kwargs)
+        self._world_id = secrets.randbits(64) or 1  # 0 stands for none
         self._settings = ParameterSet(self, ROBOT_BRIDGE_NODE, is_configured=lambda: True)
         self._contract = load_contract(Path(self._settings['contract']).expanduser())
         if faults := type_faults(self._contract, definitions):
@@ -104,6 +106,9 @@ class RobotBridgeNode(Node):
 
     def _on_action(self, message: ActionCommand) -> None:
         self._policies.saw(message.instance, time.monotonic())
+        if message.world_id not in (0, self._world_id):
+            self._note('refused_actions', 'the action is for another world')
+            return
         if message.episode_id != EPISODE:
             self._note('refused_actions', f'the action is for episode {message.episode_id}')
             return
@@ -153,6 +158,7 @@ class RobotBridgeNode(Node):
             state_message(
                 header,
                 episode_id=EPISODE,
+                world_id=self._world_id,
                 step=self._step,
                 observation=observation,
                 position=(x, y),
