@@ -39,7 +39,7 @@ class DrawSettings(Settings):
     ttt: TTTSettings = Field(TTTSettings(), description='test-time training')
     filter: FilterConfig = FilterConfig(variant='gcttt')
     standing: bool = Field(
-        False, description='start humanoids on their feet, not fallen as OGBench does'
+        False, description='start humanoids on their feet, not dropped as OGBench does'
     )
     seed: int = Field(0, ge=0, description='random seed of starts, goals and adaptations')
     out: Path = Field(Path('out/episodes'), description='files to write, without suffix')

@@ -54,7 +54,7 @@ class EpisodeSettings(Settings):
     episodes: int = Field(10, ge=1, description='episodes per task and seed')
     seeds: tuple[int, ...] = Field((0, 1, 2), min_length=1, description='evaluation seeds')
     standing: bool = Field(
-        False, description='start humanoids on their feet, not fallen as OGBench does'
+        False, description='start humanoids on their feet, not dropped as OGBench does'
     )
 
 

@@ -94,7 +94,7 @@ class GenerateSettings(Resumable):
         if maze.startswith('humanoidmaze'):
             if self.output and self.output.stem == name:
                 raise ValueError(
-                    f"{self.output}: is the name of OGBench's data, whose humanoid starts fallen "
+                    f"{self.output}: is the name of OGBench's data, whose humanoid is dropped "
                     'and gets up; choose another for data that start standing'
                 )
             name = f'{maze}-{self.kind}-standing-v0'

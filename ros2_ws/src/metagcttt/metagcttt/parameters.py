@@ -99,7 +99,9 @@ SIM_BRIDGE_NODE = (
     Parameter('publish_clock', True, 'publish the simulated time on /clock'),
     Parameter('seed', 0, 'random seed of the first episode', (0, 2**32 - 1)),
     Parameter(
-        'standing', False, 'start the tasks of humanoids on their feet, not fallen as OGBench does'
+        'standing',
+        False,
+        'start the tasks of humanoids on their feet, not dropped as OGBench does',
     ),
     Parameter('start_paused', False, 'start paused, until the service pause resumes'),
 )
