@@ -288,16 +288,16 @@ def test_contract_that_does_not_fit_is_refused(
 @pytest.mark.slow
 def test_process_says_farewell_with_zeros(graph: Graph, tmp_path: Path, start_process) -> None:
     file = tmp_path / 'robot.yaml'
-    file.write_text(
-        DRIVE.replace(
-            'fallback: zeros',
-            'fallback: {fault: nothing, silent: nothing, '
-            'no_goal: nothing, stop: nothing, shutdown: zeros}',
-        )
-    )
+    cases = '{fault: zeros, silent: nothing, no_goal: nothing, stop: nothing, shutdown: zeros}'
+    file.write_text(DRIVE.replace('fallback: zeros', f'fallback: {cases}'))
     commands = graph.collect(Twist, 'cmd_vel', RELIABLE)
     process = start_process('robot_bridge_node', contract=str(file))
-    graph.wait_for_publishers()
+    # Nothing is observed, so there are zeros: the process has found this subscription.
+    graph.wait(lambda: commands, 'zeros')
+    graph.call(SetBool, 'set_stop', SetBool.Request(data=True))
+    graph.wait_for(0.5)
+    commands.clear()
+    graph.wait_for(0.5)
     assert commands == []
     assert process.stop(signal_number=signal.SIGTERM) == 0
     graph.wait(lambda: commands, 'the farewell')
