@@ -50,10 +50,10 @@ class Rig:
         now_ns = self.graph.node.get_clock().now().nanoseconds
         self._odometry.publish(odometry(now_ns - round(late_s * 1e9), **fields))
 
-    def answer(self, step: int | None = None, instance: int = 1, episode_id: int = 1) -> None:
+    def answer(self, step: int | None = None, instance: int = 1, **names: int) -> None:
         self._actions.publish(
             ActionCommand(
-                episode_id=episode_id,
+                **{'episode_id': 1, 'world_id': self.states[-1].world_id, **names},
                 step=self.states[-1].step if step is None else step,
                 query_id=self.query_id,
                 values=self.values,
@@ -155,6 +155,18 @@ def test_old_action_does_not_move_the_robot(rig: Rig) -> None:
         rig.send_odometry()
         rig.graph.wait_for(0.05)
     assert rig.stands()
+
+
+def test_action_for_an_earlier_bridge_does_not_move_the_robot(rig: Rig) -> None:
+    rig.drive()
+    rig.drive_until(rig.stands, 'a stop', act=False)
+    other = rig.states[-1].world_id ^ 1
+    for _ in range(5):
+        rig.answer(world_id=other)
+        rig.send_odometry()
+        rig.graph.wait_for(0.05)
+    assert rig.stands()
+    rig.drive()
 
 
 def test_stop_is_latched_until_it_is_cleared(rig: Rig) -> None:
