@@ -76,7 +76,7 @@ metagcttt meta-train --dataset mine.npz --checkpoint base/checkpoint --out meta 
   --meta.outer-steps 2 --meta.inner-steps 2
 refuses 'pip install "metagcttt-core[mazes]"' "${evaluate[@]}"
 refuses 'pip install "metagcttt-core[plots]"' loss-curves --dataset mine.npz
-for program in demo evaluate-ros 'benchmark ros' 'benchmark restarts'; do
+for program in demo view evaluate-ros 'benchmark ros' 'benchmark restarts'; do
   refuses 'make setup' $program
 done
 install '[mazes]'

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -25,7 +26,8 @@ _DESCRIPTION = """Drive the point maze over ROS 2: three policies, five goals.
 Example: make demo, or metagcttt demo in a set-up checkout
 Starts sim_bridge_node, goal_node and policy_node as separate processes, publishes the five
 evaluation goals on `goal_pose` for each arm, prints a table and writes OUT/summary.json and
-OUT/demo.png."""
+OUT/demo.png. With --view the goals are yours: the post-trained policy drives to where you click
+in a browser, until Ctrl-C."""
 
 _ENVIRONMENT = 'pointmaze-medium-v0'
 _ASSETS = 'pointmaze-medium-navigate'
@@ -38,6 +40,7 @@ class DemoSettings(Settings):
     steps: int = Field(10, ge=1, description='test-time training steps K of the adapting arms')
     seed: int = Field(0, ge=0, description='random seed of starts, goals and adaptations')
     timeout_s: float = Field(60.0, gt=0, description='longest wait for one goal, seconds')
+    view: bool = Field(False, description='send the goals by hand, in the live view')
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -48,6 +51,9 @@ def main(argv: list[str] | None = None) -> None:
     from metagcttt_tools.graph.process import NodeFailedError
 
     try:
+        if settings.view:
+            drive_by_hand(settings)
+            return
         outcomes = run_arms(settings)
     except (NodeFailedError, NoAnswerError, FileNotFoundError) as error:
         fail(str(error))
@@ -82,6 +88,24 @@ def run_arms(settings: DemoSettings) -> dict[str, list[GoalOutcome]]:
         ],
         logs=settings.out / 'logs',
     )
+
+
+def drive_by_hand(settings: DemoSettings) -> None:
+    """Run the post-trained policy in real time and show it until Ctrl-C ends the process."""
+    from metagcttt_tools.graph.drive import check, own_domain
+    from metagcttt_tools.graph.process import NodeProcess
+    from metagcttt_tools.live.view import show
+
+    with own_domain(), ExitStack() as stack:
+        nodes = [
+            stack.enter_context(NodeProcess(name, given, settings.out / 'logs' / f'{name}.log'))
+            for name, given in (
+                ('sim_bridge_node', {'seed': settings.seed}),
+                ('goal_node', {'seed': settings.seed}),
+                ('policy_node', {'adapt_steps': settings.steps}),
+            )
+        ]
+        show(out=settings.out, check=partial(check, nodes))
 
 
 def report(settings: DemoSettings, outcomes: dict[str, list[GoalOutcome]]) -> None:

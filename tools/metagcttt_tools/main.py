@@ -48,6 +48,7 @@ PROGRAMS: dict[str, Program | Group] = {
     'sweep': Program('sweep', 'Run a whole study: training, post-training, evaluation.'),
     'report': Program('report', 'Tables and figures of a study.'),
     'demo': Program('demo', 'Drive the point maze over ROS 2: three policies, five goals.'),
+    'view': Program('view', 'Watch a running robot in a browser and send goals by a click.'),
     'doctor': Program('doctor', 'What works on this machine, and how to mend the rest.'),
     'presets': Program('show_presets', "List the presets; the paper's settings as tables."),
     'diagnostics': Program('diagnostics', 'Draw how a post-training run went.'),

@@ -10,6 +10,7 @@ from metagcttt_tools import demo
 from metagcttt_tools.benchmarks import restarts, ros, state_source
 from metagcttt_tools.graph import drive
 from metagcttt_tools.graph import process as nodes
+from metagcttt_tools.live import view as live
 import numpy as np
 import pytest
 import rclpy
@@ -27,6 +28,7 @@ def watch_graph(patch: pytest.MonkeyPatch, seen: Seen) -> None:
 
     patch.setattr(drive, 'drive_arms', note)
     patch.setattr(demo, 'report', lambda *_: None)
+    patch.setattr(demo, 'drive_by_hand', lambda settings: seen.append('by hand'))
 
 
 NO_PARAMETER = 'policy_node has no such parameter'
@@ -72,7 +74,24 @@ EVALUATE_ROS = Walk(
     },
     watch_graph,
 )
-DEMO = Walk('demo', {}, {'out': 'elsewhere', 'steps': 3, 'seed': 1, 'timeout_s': 7.0}, watch_graph)
+DEMO = Walk(
+    'demo',
+    {},
+    {'out': 'elsewhere', 'steps': 3, 'seed': 1, 'timeout_s': 7.0, 'view': True},
+    watch_graph,
+)
+
+
+def watch_view(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    patch.setattr(live, 'show', lambda **settings: seen.append(settings))
+
+
+VIEW = Walk(
+    'view',
+    {},
+    {'host': '0.0.0.0', 'port': 9000, 'robot': '/robot1', 'out': 'elsewhere'},
+    watch_view,
+)
 
 
 def watch_latency(patch: pytest.MonkeyPatch, seen: Seen) -> None:
@@ -164,7 +183,7 @@ BENCHMARK_RESTARTS = Walk(
     watch_restarts,
 )
 
-WALKS = (EVALUATE_ROS, DEMO, BENCHMARK_ROS, BENCHMARK_RESTARTS)
+WALKS = (EVALUATE_ROS, DEMO, VIEW, BENCHMARK_ROS, BENCHMARK_RESTARTS)
 
 
 @walks_through(WALKS)

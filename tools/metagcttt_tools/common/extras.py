@@ -15,6 +15,7 @@ EXTRAS = {
     'rosbags': 'recordings',
     'scipy': 'plots',
     'tensorboard': 'plots',
+    'viser': 'view',
 }
 """The extra that brings a package, by the name under which it is imported."""
 

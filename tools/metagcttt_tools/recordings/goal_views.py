@@ -75,7 +75,7 @@ def read_goal_views(
     ]
     if not views:
         raise DatasetError(f'{recording}: no goal was in force while {robot}/state was recorded')
-    return _maze(by_type[_GRID][-1]), views
+    return maze_of(by_type[_GRID][-1]), views
 
 
 def _paths(
@@ -107,7 +107,7 @@ def _segments(report: Any, dataset: TrajectoryDataset | None) -> list[np.ndarray
     return [dataset.observations[start:stop, :2] for start, stop in rows]
 
 
-def _maze(grid: Any) -> MazeMap:
+def maze_of(grid: Any) -> MazeMap:
     """The walls of an OccupancyGrid, whose origin is the corner of cell (0, 0)."""
     info = grid.info
     half = info.resolution / 2

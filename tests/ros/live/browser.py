@@ -1,0 +1,86 @@
+"""A person at the live view: a headless Chromium that clicks."""
+
+from collections.abc import Callable
+import shutil
+import time
+from typing import Any, Self
+
+from metagcttt_tools.live.scene import viewpoint
+import numpy as np
+import pytest
+from selenium import webdriver
+from selenium.common.exceptions import WebDriverException
+from selenium.webdriver.chrome.service import Service
+from selenium.webdriver.common.by import By
+from sim_bridge import MazeMap
+
+CHROMIUM, DRIVER = shutil.which('chromium'), shutil.which('chromedriver')
+needs_chromium = pytest.mark.skipif(
+    not (CHROMIUM and DRIVER), reason='no Chromium with a driver here: tools/chromium.sh as root'
+)
+_FIELD_OF_VIEW = np.radians(75)  # vertical, of a camera that nobody has moved
+# As root in a container, and drawn by the processor.
+_OPTIONS = (
+    *('--headless=new', '--no-sandbox', '--disable-dev-shm-usage', '--window-size=1000,700'),
+    *('--use-angle=swiftshader', '--enable-unsafe-swiftshader'),
+)
+
+
+class Browser:
+    """A tab with the live view."""
+
+    def __init__(self, url: str, maze: MazeMap) -> None:
+        options = webdriver.ChromeOptions()
+        options.binary_location = CHROMIUM
+        for option in _OPTIONS:
+            options.add_argument(option)
+        self._maze = maze
+        self.driver = webdriver.Chrome(options=options, service=Service(DRIVER))
+        self.driver.get(url)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.driver.quit()
+
+    def text(self) -> str:
+        return self.driver.find_element(By.TAG_NAME, 'body').text
+
+    def click_floor(self, xy: tuple[float, float]) -> None:
+        """Click where a point of the floor is drawn."""
+        camera, target = (np.array(point) for point in viewpoint(self._maze))
+        ahead = (target - camera) / np.linalg.norm(target - camera)
+        right = np.cross(ahead, (0, 0, 1)) / np.linalg.norm(np.cross(ahead, (0, 0, 1)))
+        ray = np.array((*xy, 0.0)) - camera
+        seen = np.array((ray @ right, -(ray @ np.cross(right, ahead)))) / (ray @ ahead)
+        canvas = self.driver.find_element(By.TAG_NAME, 'canvas')
+        pixels = seen * canvas.rect['height'] / 2 / np.tan(_FIELD_OF_VIEW / 2)
+        x, y = (round(float(value)) for value in pixels)
+        webdriver.ActionChains(self.driver).move_to_element_with_offset(
+            canvas, x, y
+        ).click().perform()
+
+    def click_button(self, label: str) -> None:
+        self._click(f'//button[.//*[text()="{label}"]]')
+
+    def click_checkbox(self, label: str) -> None:
+        self._click(f'//*[normalize-space()="{label}"]/following::input[1]')
+
+    def _click(self, xpath: str) -> None:
+        self.driver.find_element(By.XPATH, xpath).click()
+
+    def wait(self, condition: Callable[[], Any], what: str, timeout_s: float = 120.0) -> Any:
+        """Wait until `condition` gives something true; the page may be drawn anew meanwhile."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            try:
+                if result := condition():
+                    return result
+            except WebDriverException:
+                pass
+            assert time.monotonic() < deadline, f'waited in vain for {what}'
+            time.sleep(0.1)
+
+    def wait_for_text(self, text: str) -> None:
+        self.wait(lambda: text in self.text(), f'{text!r} on the page')

@@ -1,0 +1,140 @@
+"""The live view as its users have it: processes, a browser and clicks."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+import signal
+import socket
+import subprocess
+import sys
+
+from metagcttt_interfaces.action import ReachGoal
+from metagcttt_interfaces.msg import EpisodeEvent
+from metagcttt_tools.graph.process import NodeProcess
+from metagcttt_tools.recordings.mcap import read_messages
+import pytest
+from rcl_interfaces.srv import GetParameters
+from sim_bridge import maze_map
+from tests.ros.graph import Graph, Record
+from tests.ros.live.browser import Browser, needs_chromium
+
+MAZE = maze_map('pointmaze-medium-v0')
+STATES = ('metagcttt_interfaces/msg/MazeState',)
+TASK_1_GOAL, NEAR = (20.0, 20.0), (4.0, 0.0)
+
+pytestmark = [pytest.mark.slow, pytest.mark.mujoco, pytest.mark.timeout(600), needs_chromium]
+
+
+@pytest.fixture
+def nodes(start_process: Callable[..., NodeProcess], graph: Graph) -> dict[str, NodeProcess]:
+    """The three nodes as they start without arguments; the robot at the start of task 1."""
+    names = ('sim_bridge_node', 'goal_node', 'policy_node')
+    nodes = {name: start_process(name) for name in names}
+    graph.set_task(1, send_goal=False)
+    return nodes
+
+
+@pytest.fixture
+def view(ros_domain: int, tmp_path: Path) -> Iterator[subprocess.Popen]:
+    """`metagcttt view`; the fixture's `url` attribute is where it listens."""
+    command = [sys.executable, '-m', 'metagcttt_tools', 'view', '--out', str(tmp_path / 'out')]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        lines = iter(process.stdout.readline, '')
+        line = next(line for line in lines if line.startswith('live view: '))
+        process.url = line.split()[-1]
+        yield process
+        process.terminate()
+        assert process.wait(30) == 0
+
+
+@pytest.fixture
+def record(graph: Graph, nodes: dict[str, NodeProcess]) -> Record:
+    return Record(graph)
+
+
+def end_of_goal(graph: Graph, record: Record, number: int) -> EpisodeEvent:
+    """How the goal of this number ended."""
+    ends = (EpisodeEvent.REACHED, EpisodeEvent.TIMED_OUT, EpisodeEvent.ENDED)
+    return graph.wait(
+        lambda: next((e for e in record.events if e.query_id == number and e.kind in ends), None),
+        f'the end of goal {number}',
+    )
+
+
+def goal(graph: Graph, record: Record, number: int):
+    return graph.wait(
+        lambda: next((q for q in record.queries if q.query_id == number and q.active), None),
+        f'goal {number}',
+    )
+
+
+def test_click_on_the_floor_makes_the_robot_reach_it(
+    graph: Graph, record: Record, view: subprocess.Popen
+) -> None:
+    with Browser(view.url, MAZE) as browser:
+        browser.wait_for_text('stepping')
+        browser.wait_for_text('policy_node')
+        browser.click_floor(TASK_1_GOAL)
+        clicked = goal(graph, record, 1).position
+        assert (clicked.x, clicked.y) == pytest.approx(TASK_1_GOAL, abs=0.2)
+        assert end_of_goal(graph, record, 1).kind == EpisodeEvent.REACHED
+        browser.wait_for_text('goal 1 reached')
+
+        browser.click_floor(NEAR)
+        goal(graph, record, 2)
+        browser.click_button('Cancel goal')
+        assert end_of_goal(graph, record, 2).error_code == ReachGoal.Result.CANCELED
+
+        browser.click_floor((-4.0, -4.0))  # a wall
+        browser.wait_for_text('goal rejected: ')
+
+
+def test_controls_change_the_graph(graph: Graph, record: Record, view, tmp_path: Path) -> None:
+    def adapt_steps() -> int:
+        request = GetParameters.Request(names=['adapt_steps'])
+        answer = graph.call(GetParameters, 'policy_node/get_parameters', request)
+        return answer.values[0].integer_value
+
+    with Browser(view.url, MAZE) as browser:
+        browser.wait_for_text('stepping')
+        browser.wait_for_text('policy_node')
+        assert adapt_steps() == 10
+        browser.click_checkbox('Test-time training')
+        graph.wait(lambda: adapt_steps() == 0, 'no adaptation')
+
+        browser.click_checkbox('Record')
+        browser.wait_for_text('recording to')
+        path = graph.wait(lambda: list(tmp_path.glob('out/*.mcap')), 'a recording')[0]
+        graph.wait(lambda: path.stat().st_size, 'something in it')
+        graph.wait(lambda: read_messages(path, STATES).messages, 'a state in it')
+        browser.click_checkbox('Record')
+        browser.wait(lambda: 'messages in' in path.with_suffix('.log').read_text(), 'its end')
+    assert read_messages(path, STATES).complete
+
+
+def test_lost_browser_and_lost_nodes_harm_nothing(
+    graph: Graph, record: Record, view, nodes: dict[str, NodeProcess], start_process
+) -> None:
+    with Browser(view.url, MAZE) as browser:
+        browser.wait_for_text('stepping')
+        browser.wait_for_text('policy_node')
+        browser.click_floor(TASK_1_GOAL)
+        goal(graph, record, 1)
+    assert end_of_goal(graph, record, 1).kind == EpisodeEvent.REACHED
+    with Browser(view.url, MAZE) as browser:
+        browser.wait_for_text('goal 1 reached')
+        nodes['policy_node'].kill()
+        browser.wait_for_text('policy_node: silent')
+        start_process('policy_node')
+        browser.wait(lambda: 'silent' not in browser.text(), 'the new policy')
+        browser.click_floor(NEAR)
+        graph.wait(lambda: [r for r in record.reports if r.query_id == 2], 'an adaptation')
+    assert view.poll() is None
+
+
+def test_only_this_machine_reaches_it(view) -> None:
+    port = int(view.url.rpartition(':')[2])
+    socket.create_connection(('127.0.0.1', port)).close()
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(('127.0.0.2', port))  # also this machine
+    view.send_signal(signal.SIGINT)
+    assert view.wait(30) == 0

@@ -1,0 +1,133 @@
+"""The panel beside the scene: what the robot does, the health of its nodes, and the controls."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import viser
+
+from metagcttt_tools.live.scene import AFTER, BEFORE, Color, DATA, GOAL, RETRIEVED, ROBOT
+
+_LEVELS: tuple[Color, ...] = ((0, 158, 115), (230, 159, 0), (200, 0, 0), (200, 0, 0))
+_LEGEND = {
+    'robot': ROBOT,
+    'goal': GOAL,
+    'data': DATA,
+    'retrieved': RETRIEVED,
+    'actions before': BEFORE,
+    'and after adapting': AFTER,
+}
+
+
+@dataclass(frozen=True)
+class Controls:
+    """What the panel asks of the graph; called in threads of the server.
+
+    Attributes:
+        cancel: Cancel the goal under way.
+        set_steps: Adapt by so many gradient steps K from the next goal on; 0: base policy.
+        change_policy: Take another checkpoint.
+        record: Begin or end a recording.
+    """
+
+    cancel: Callable[[], None]
+    set_steps: Callable[[int], None]
+    change_policy: Callable[[str], None]
+    record: Callable[[bool], None]
+
+
+class Panel:
+    """The controls and texts; their values follow the graph."""
+
+    def __init__(self, gui: viser.GuiApi, controls: Controls) -> None:
+        """Create the panel.
+
+        Args:
+            gui: Of the server.
+            controls: What to do at a click.
+        """
+        self._gui = gui
+        self._state = gui.add_markdown('')
+        self._message = gui.add_markdown('Click on the floor to send a goal.')
+        cancel = gui.add_button('Cancel goal')
+        self._adapt = gui.add_checkbox('Test-time training', True)
+        self._steps = gui.add_number('K (gradient steps)', 10, min=1, max=10000, step=1)
+        self._checkpoints: dict[str, Path] = {}
+        self._policy = gui.add_dropdown('Policy', ('',))
+        self._record = gui.add_checkbox('Record', False)
+        with gui.add_folder('Loss over K steps'):
+            self._losses = gui.add_uplot(
+                (np.zeros(1), np.zeros(1)),
+                ({'label': 'step'}, {'label': 'loss', 'stroke': '#009E73', 'width': 2}),
+                scales={'x': {'time': False}},
+                height=170,
+            )
+        with gui.add_folder('Nodes'):
+            self._health = gui.add_html('')
+        gui.add_html(_html(' '.join(_dot(color) + name for name, color in _LEGEND.items())))
+
+        def ask_steps(event: viser.GuiEvent) -> None:
+            if event.client is not None:  # else it is the value that the graph has
+                controls.set_steps(int(self._steps.value) if self._adapt.value else 0)
+
+        def by_hand(ask: Callable[[Any], None]) -> Callable[[viser.GuiEvent], None]:
+            return lambda event: ask(event.target.value) if event.client is not None else None
+
+        cancel.on_click(lambda _: controls.cancel())
+        self._adapt.on_update(ask_steps)
+        self._steps.on_update(ask_steps)
+        self._policy.on_update(
+            by_hand(lambda name: controls.change_policy(str(self._checkpoints[name])))
+        )
+        self._record.on_update(by_hand(controls.record))
+
+    def say(self, text: str) -> None:
+        """Show a message, such as why a request failed."""
+        self._message.content = text
+
+    def show_state(self, text: str) -> None:
+        """Show what the robot is doing."""
+        _set(self._state, 'content', text)
+
+    def show_health(self, health: Sequence[tuple[str, int, str]]) -> None:
+        """Show name, level and message of each node."""
+        lines = [
+            f'{_dot(_LEVELS[level])}<b>{escape(name)}</b>: {escape(text)}'
+            for name, level, text in health
+        ]
+        _set(self._health, 'content', _html('<br>'.join(lines) or 'none heard of'))
+
+    def show_losses(self, losses: Sequence[float]) -> None:
+        """Draw the loss of each gradient step."""
+        self._losses.data = np.arange(1.0, len(losses) + 1), np.array(losses)
+
+    def show_settings(self, steps: int, checkpoint: Path) -> None:
+        """Show the policy node's K and checkpoint, and those beside it, to which it can change."""
+        _set(self._adapt, 'value', steps > 0)
+        if steps:
+            _set(self._steps, 'value', steps)
+        beside = [found.parent for found in checkpoint.parent.glob('*/checkpoint.json')]
+        self._checkpoints = {path.name: path for path in sorted({*beside, checkpoint})}
+        _set(self._policy, 'options', tuple(self._checkpoints))
+        _set(self._policy, 'value', checkpoint.name)
+
+    def show_recording(self, recording: bool) -> None:
+        """Show whether a recording is under way."""
+        _set(self._record, 'value', recording)
+
+
+def _set(handle: Any, name: str, value: Any) -> None:
+    """Set an attribute of a handle when it differs: every change travels to the browsers."""
+    if getattr(handle, name) != value:
+        setattr(handle, name, value)
+
+
+def _html(text: str) -> str:
+    return f'<div style="font-size: 0.85em; padding: 0 0.8em">{text}</div>'
+
+
+def _dot(color: Color) -> str:
+    return f'<span style="color: rgb{color}">&#9679;</span>&nbsp;'
