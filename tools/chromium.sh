@@ -9,5 +9,7 @@ if [ "$(id -u)" != 0 ] || ! command -v apt-get >/dev/null; then
   exit 0
 fi
 export DEBIAN_FRONTEND=noninteractive
-apt-get -qq update
-apt-get -qq install -y --no-install-recommends chromium chromium-driver >/dev/null
+if ! timeout 300 apt-get -qq update || ! timeout 300 apt-get -qq install -y \
+  --no-install-recommends chromium chromium-driver >/dev/null; then
+  echo 'chromium: cannot be installed: its test is skipped'
+fi

@@ -186,7 +186,7 @@ def test_goal_pose_moves_the_robot_in_realtime(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('node', NODES)
+@pytest.mark.parametrize('node', [node for node in NODES if node != 'robot_bridge_node'])
 def test_node_starts_without_arguments_on_the_committed_assets(
     graph: Graph, start_process: Callable[..., NodeProcess], node: str
 ) -> None:

@@ -202,6 +202,16 @@ def test_silence_of_the_simulator_ends_the_goal(make_goal_rig: Callable[..., Goa
     assert sent.result(30).error_code == ReachGoal.Result.STATE_LOST
 
 
+def test_silence_of_the_policy_ends_the_goal_in_lockstep(
+    make_goal_rig: Callable[..., GoalRig],
+) -> None:
+    rig = make_goal_rig(partner_timeout_s=3600.0)
+    rig.state()
+    sent = rig.commander.send(FREE)
+    change(rig.node, partner_timeout_s=0.2)
+    assert sent.result(30).error_code == ReachGoal.Result.POLICY_LOST
+
+
 def test_silence_of_the_policy_is_diagnosed(make_goal_rig: Callable[..., GoalRig]) -> None:
     rig = make_goal_rig(policy_timeout_s=3600.0)
     rig.state()
