@@ -24,6 +24,7 @@ BEFORE_BLOCKS = {
     'README.md': ['metagcttt generate --kind stitch'],
 }
 BEFORE_PROSE = {
+    'docs/faq.md': ['metagcttt generate --kind navigate', 'metagcttt pretrain'],
     'README.md': ['metagcttt meta-train --preset pointmaze-medium-navigate-cpu'],
     'docs/guide.md': [
         'metagcttt generate --kind navigate',
