@@ -62,14 +62,14 @@ class Passes:
             self._weights, self._hidden, self._buffers, strict=False
         ):
             self._inputs.append(x.to(self._dtype))
-            z = _product(self._inputs[-1], weight, layer[1]).to(torch.float32)
+            z = product(self._inputs[-1], weight, layer[1]).to(torch.float32)
             x = buffers.gelu(z)
             if self._norm:
                 width = [x.shape[1]]
                 x, mean, rstd = torch.native_layer_norm(x, width, layer[2], layer[3], 1e-6)
                 self._saved.append((mean, rstd))
         self._inputs.append(x.to(self._dtype))
-        return _product(self._inputs[-1], self._weights[-1], self._head[1]).to(torch.float32)
+        return product(self._inputs[-1], self._weights[-1], self._head[1]).to(torch.float32)
 
     def backward(self, gradient: Tensor, *, weights: bool = True, inputs: bool = False) -> Tensor:
         """Take the gradient of the last forward pass's outputs (B, out_dim) back.
@@ -92,7 +92,7 @@ class Passes:
                 _weight_gradient(g, self._inputs[index], into[0])
             if not index and not inputs:
                 break
-            g = _product(g, self._weights[index].t()).to(torch.float32)
+            g = product(g, self._weights[index].t()).to(torch.float32)
             if index:
                 layer, buffers = self._hidden[index - 1], self._buffers[index - 1]
                 if self._norm:
@@ -132,8 +132,8 @@ class _Buffers:
         return torch.mul(s, gradient, out=self.slope)
 
 
-def _product(left: Tensor, right: Tensor, bias: Tensor | None = None) -> Tensor:
-    """Left (n, k) times the transpose of right (m, k), plus a bias (m,)."""
+def product(left: Tensor, right: Tensor, bias: Tensor | None = None) -> Tensor:
+    """Left (n, k) times the transpose of right (m, k), plus a bias (m,), by the faster library."""
     small = len(left) * len(right) * left.shape[1] < _SMALL_PRODUCT
     if small or _OPS is None or left.dtype != torch.float32:
         if bias is None:
@@ -146,6 +146,6 @@ def _weight_gradient(gradient: Tensor, inputs: Tensor, into: Tensor) -> None:
     """Write gradient (B, m) transposed times inputs (B, n) into (m, n)."""
     # oneDNN copies its left operand to turn it: the smaller one.
     if gradient.shape[1] <= inputs.shape[1]:
-        into.copy_(_product(gradient.t(), inputs.t()))
+        into.copy_(product(gradient.t(), inputs.t()))
     else:
-        into.copy_(_product(inputs.t(), gradient.t()).t())
+        into.copy_(product(inputs.t(), gradient.t()).t())
