@@ -100,6 +100,8 @@ def adapt(
         optimizer_state=state,
         test_batch=test_batch,
         actor_only=config.actor_only,
+        engine=config.engine,
+        precision=config.precision,
         should_stop=should_stop,
         on_step=on_step,
     )

@@ -5,7 +5,9 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from metagcttt_core.config.settings import Settings
-from metagcttt_core.training.config import OptimizerName
+from metagcttt_core.training.config import OptimizerName, Precision
+
+EngineName = Literal['auto', 'eager']
 
 
 class InnerLoopConfig(Settings):
@@ -19,6 +21,12 @@ class InnerLoopConfig(Settings):
     actor_only: bool = Field(False, description='update the actor and leave the critic')
     fix_actor_goal: float = Field(
         1.0, ge=0, le=1, description="probability that an actor goal is the query's goal"
+    )
+    engine: EngineName = Field(
+        'auto', description='gradients written out where the agent has them, or by autograd'
+    )
+    precision: Precision = Field(
+        'float32', description='of matrix products; weights and optimiser stay float32'
     )
     ratio: float = Field(
         1.0, ge=0, le=1, description='share of a batch from the support, the rest from all data'

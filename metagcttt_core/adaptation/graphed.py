@@ -55,7 +55,7 @@ class GraphedInnerLoop:
         for state in self._optimizer.state.values():
             for moment in state.values():
                 moment.zero_()
-        best = None if test_batch is None else BestStep(self._agent, test_batch, self._actor_only)
+        best = None if test_batch is None else BestStep(self._agent, self._test_loss(test_batch))
         losses = []
         for step, batch in enumerate(itertools.chain([first], remaining), start=1):
             losses.append(self._step(batch))
@@ -71,6 +71,9 @@ class GraphedInnerLoop:
             test_losses=[] if best is None else best.losses,
             best_step=len(losses) if best is None else best.step,
         )
+
+    def _test_loss(self, batch: TensorBatch) -> Callable[[], Tensor]:
+        return lambda: self._agent.losses(batch, actor_only=self._actor_only)[0]
 
     def _capture(self, batch: TensorBatch) -> None:
         self._batch = {key: values.clone() for key, values in batch.items()}

@@ -1,16 +1,18 @@
 """The inner loop U^K: gradient steps from base weights to expert weights (paper, equation 5)."""
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 import math
 
 import torch
 from torch.profiler import record_function
 
+from metagcttt_core.adaptation.config import EngineName
+from metagcttt_core.adaptation.engine import make_engine
 from metagcttt_core.adaptation.result import Adaptation, AdaptationCancelled, OnStep
 from metagcttt_core.agents.agent import Agent, OptimizerState, TensorBatch
-from metagcttt_core.training.config import OptimizerName
+from metagcttt_core.training.config import OptimizerName, Precision
 from metagcttt_core.training.optimizers import make_optimizer
-from metagcttt_core.training.step import gradient_step
 
 INNER_STEP, TEST_LOSS = 'inner step', 'test loss'
 """Names of the ranges that `torch.profiler` sees."""
@@ -25,6 +27,8 @@ def run_inner_loop(
     optimizer_state: OptimizerState | None = None,
     test_batch: TensorBatch | None = None,
     actor_only: bool = False,
+    engine: EngineName = 'eager',
+    precision: Precision = 'float32',
     should_stop: Callable[[], bool] | None = None,
     on_step: OnStep | None = None,
 ) -> Adaptation:
@@ -40,6 +44,8 @@ def run_inner_loop(
             weights of the smallest one, the earliest on ties (test-aware early stopping). A
             non-finite loss never wins.
         actor_only: Train the actor and leave the rest.
+        engine: What computes the steps; `auto` equals `eager` to rounding and is faster.
+        precision: Of the matrix products; see `make_engine`.
         should_stop: Asked before every step.
         on_step: Called after every step.
 
@@ -49,13 +55,16 @@ def run_inner_loop(
     agent = base.clone()
     parameters = list(agent.trained_parameters(actor_only=actor_only))
     stepper = make_optimizer(optimizer, parameters, lr, optimizer_state)
-    best = None if test_batch is None else BestStep(agent, test_batch, actor_only)
+    steps = make_engine(
+        engine, agent, stepper, parameters, actor_only=actor_only, precision=precision
+    )
+    best = None if test_batch is None else BestStep(agent, partial(steps.test_loss, test_batch))
     train_losses: list[torch.Tensor] = []
     for step, batch in enumerate(batches, start=1):
         if should_stop is not None and should_stop():
             raise AdaptationCancelled(f'cancelled before inner step {step}')
         with record_function(INNER_STEP):
-            loss, parts = gradient_step(agent, stepper, parameters, batch, actor_only=actor_only)
+            loss, parts = steps.step(batch)
         train_losses.append(loss)
         if on_step is not None:
             on_step(step, {'total': loss, **parts})
@@ -80,11 +89,9 @@ class BestStep:
         step: k*, the step of the smallest one.
     """
 
-    def __init__(self, agent: Agent, test_batch: TensorBatch, actor_only: bool) -> None:
+    def __init__(self, agent: Agent, test_loss: Callable[[], torch.Tensor]) -> None:
         """Take the test loss of `agent` as it is, after no steps."""
-        self._agent = agent
-        self._batch = test_batch
-        self._actor_only = actor_only
+        self._test_loss = test_loss
         self._weights = [weight.detach() for weight in agent.parameters()]
         self._best_weights = [weight.clone() for weight in self._weights]
         self._smallest = math.inf
@@ -96,7 +103,7 @@ class BestStep:
     def test(self, step: int) -> None:
         """Take the test loss after `step` steps and keep the weights if they are the best."""
         with record_function(TEST_LOSS):
-            loss = self._agent.losses(self._batch, actor_only=self._actor_only)[0].item()
+            loss = self._test_loss().item()
         self.losses.append(loss)
         if math.isfinite(loss) and loss < self._smallest:
             self.step, self._smallest = step, loss

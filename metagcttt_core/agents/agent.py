@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 import copy
 import hashlib
 import math
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -13,6 +13,9 @@ from torch import nn, Tensor
 
 from metagcttt_core.agents.config import AgentSettings
 from metagcttt_core.agents.networks import MLP
+
+if TYPE_CHECKING:
+    from metagcttt_core.agents.analytic import AnalyticLoss
 
 TensorBatch = dict[str, Tensor]
 OptimizerState = dict[int, dict[str, Tensor]]
@@ -74,6 +77,17 @@ class Agent(nn.Module, ABC):
 
     def update_targets(self) -> None:
         """Move the networks that trail others; called with each full update, before its step."""
+
+    def analytic_loss(
+        self, *, actor_only: bool = False, dtype: torch.dtype = torch.float32
+    ) -> 'AnalyticLoss | None':
+        """The same loss with its gradient written out, or None where `losses` is all there is.
+
+        Args:
+            actor_only: Leave out the terms that do not train the actor.
+            dtype: Of the operands of matrix products.
+        """
+        return None
 
     @property
     def value_fn(self) -> Callable[[np.ndarray, np.ndarray], np.ndarray] | None:
@@ -152,6 +166,10 @@ class Agent(nn.Module, ABC):
             std = 1.0 if self.settings.const_std else self._log_std().exp().cpu().numpy()
             mean = mean + temperature * std * rng.standard_normal(mean.shape, dtype=np.float32)
         return np.clip(mean, -1, 1)
+
+    def _has_analytic_loss_of(self, agent_type: type['Agent']) -> bool:
+        """True if the loss written out for `agent_type` is this agent's, no subclass's."""
+        return type(self) is agent_type and self.settings.const_std and self.device.type == 'cpu'
 
     @property
     def device(self) -> torch.device:

@@ -1,11 +1,15 @@
 """Goal-conditioned behavioural cloning (paper, equation 2)."""
 
-from typing import ClassVar
+from typing import ClassVar, TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
 from metagcttt_core.agents.agent import Agent, TensorBatch
 from metagcttt_core.agents.config import AgentSettings, GCBCSettings
+
+if TYPE_CHECKING:
+    from metagcttt_core.agents.analytic import AnalyticLoss
 
 
 class GCBC(Agent):
@@ -24,3 +28,13 @@ class GCBC(Agent):
         bc_loss = -log_prob.mean()
         mse = (mean.detach() - batch['actions']).square().mean()
         return bc_loss, {'bc': bc_loss.detach(), 'mse': mse}
+
+    def analytic_loss(
+        self, *, actor_only: bool = False, dtype: torch.dtype = torch.float32
+    ) -> 'AnalyticLoss | None':
+        """See `Agent.analytic_loss`; on a processor, with unit standard deviation."""
+        from metagcttt_core.agents.analytic import Cloning
+
+        if not self._has_analytic_loss_of(GCBC):
+            return None
+        return Cloning(self, dtype)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 import hashlib
-from typing import ClassVar
+from typing import ClassVar, TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,6 +12,9 @@ from torch.func import functional_call
 from metagcttt_core.agents.agent import Agent, TensorBatch
 from metagcttt_core.agents.config import AgentSettings, GCIQLSettings
 from metagcttt_core.agents.networks import MLP
+
+if TYPE_CHECKING:
+    from metagcttt_core.agents.analytic import AnalyticLoss
 
 
 class GCIQL(Agent):
@@ -98,6 +101,16 @@ class GCIQL(Agent):
             for critic in (self.critic1, self.critic2)
         ]
         return torch.minimum(*qs).squeeze(-1)
+
+    def analytic_loss(
+        self, *, actor_only: bool = False, dtype: torch.dtype = torch.float32
+    ) -> 'AnalyticLoss | None':
+        """See `Agent.analytic_loss`; on a processor, with unit standard deviation."""
+        from metagcttt_core.agents.analytic_gciql import AnalyticGCIQL
+
+        if not self._has_analytic_loss_of(GCIQL):
+            return None
+        return AnalyticGCIQL(self, dtype, actor_only=actor_only)
 
     @torch.no_grad()
     def update_targets(self) -> None:

@@ -97,10 +97,17 @@ def make_inner_loops(
     if adapts_together(base, config) if together is None else together:
         return partial(run_inner_loops, lr=lr, optimizer=optimizer, actor_only=actor_only)
     inner_loop: Callable[..., Adaptation]
-    if base.device.type == 'cuda' and cuda_graphs:
+    if base.device.type == 'cuda' and cuda_graphs and config.precision == 'float32':
         inner_loop = GraphedInnerLoop(base, lr=lr, optimizer=optimizer, actor_only=actor_only)
     else:
-        inner_loop = partial(run_inner_loop, lr=lr, optimizer=optimizer, actor_only=actor_only)
+        inner_loop = partial(
+            run_inner_loop,
+            lr=lr,
+            optimizer=optimizer,
+            actor_only=actor_only,
+            engine=config.engine,
+            precision=config.precision,
+        )
 
     def one_by_one(
         base: Agent,
@@ -118,6 +125,8 @@ def make_inner_loops(
 
 def adapts_together(agent: Agent, config: MetaConfig) -> bool:
     """True if adapting the tasks of a meta-batch together is faster."""
+    if config.precision != 'float32':
+        return False
     if agent.device.type != 'cpu':
         return config.meta_batch_size > 1
     weights = agent.trained_parameters(actor_only=config.actor_only)

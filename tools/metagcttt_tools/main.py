@@ -58,6 +58,9 @@ PROGRAMS: dict[str, Program | Group] = {
     'top-view': Program('top_view', 'Draw a recording from above, or film it.'),
     'benchmark': Group(
         {
+            'inner-loop': Program(
+                'benchmarks.inner_loop', 'Milliseconds per inner step, and of JAX.'
+            ),
             'meta': Program('benchmarks.meta', 'Outer steps of meta-post-training a second.'),
             'restarts': Program('benchmarks.restarts', 'Time until a killed node serves again.'),
             'retrieval': Program('benchmarks.retrieval', 'Milliseconds per filter query.'),

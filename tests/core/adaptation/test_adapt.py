@@ -163,7 +163,7 @@ def test_held_out_rows_are_never_trained_on_and_their_best_weights_kept(
 
     monkeypatch.setattr(GCBC, 'losses', count)
     agent = tiny_agent()
-    config = quick(steps=15, lr=0.1, early_stopping=True, test_fraction=0.3)
+    config = quick(steps=15, lr=0.1, early_stopping=True, test_fraction=0.3, engine='eager')
     result = adapt(agent, dataset, support_of(range(11)), GOAL, config)
     assert len(tested) == len(result.test_losses) == 16
     held_out = {observation.tobytes() for observation in tested[0]['observations'].numpy()}
@@ -180,7 +180,7 @@ def test_held_out_rows_are_never_trained_on_and_their_best_weights_kept(
 
 def test_test_split_has_at_most_max_test_transitions(tested):
     dataset = random_dataset([60])
-    config = quick(steps=1, early_stopping=True, test_fraction=0.5, max_test=7)
+    config = quick(steps=1, early_stopping=True, test_fraction=0.5, max_test=7, engine='eager')
     adapt(tiny_agent(), dataset, support_of(range(59)), GOAL, config)
     assert len(tested[0]['observations']) == 7
 
@@ -314,7 +314,13 @@ def test_pretrained_state_continues_adam_of_pretraining(name, actor_only, datase
         batches.append(batch)
         return losses(agent, batch, actor_only=actor_only)
 
-    config = quick(steps=1, lr=1e-3, optimizer_state='pretrained', actor_only=actor_only)
+    config = quick(
+        steps=1,
+        lr=1e-3,
+        optimizer_state='pretrained',
+        actor_only=actor_only,
+        engine='eager',
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(type(agent), 'losses', spy)
         result = adapt(agent, dataset, support_of([13]), GOAL, config)

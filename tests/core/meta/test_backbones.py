@@ -45,7 +45,8 @@ def test_meta_batch_adapted_together_gives_the_policy_of_one_by_one(
     name, settings, actor_only, algorithm, monkeypatch
 ):
     agent, dataset = tiny_agent(name, **settings), random_dataset([20, 30, 25])
-    config = quick(algorithm=algorithm, actor_only=actor_only, meta_batch_size=3)
+    # Autograd's tanh rounds the slope of saturated units, and Adam divides by it.
+    config = quick(algorithm=algorithm, actor_only=actor_only, meta_batch_size=3, engine='eager')
     trained, best_steps = [], []
     monkeypatch.setattr(experts, '_FEWEST_STACKED_ON_CPU', 2)
     for largest in (0, 10**9):

@@ -6,12 +6,13 @@ from typing import Any
 
 import metagcttt_core
 from metagcttt_core.meta import experts
-from metagcttt_tools.benchmarks import meta, retrieval, sim, training
+from metagcttt_tools.benchmarks import inner_loop, meta, retrieval, sim, training
 from metagcttt_tools.common import plots
 import numpy as np
 import pytest
 from tests.tools.settings.test_training import META
 from tests.tools.settings.walk import Proof, Seen, Walk, walks_through
+import torch
 
 
 def without_figures(
@@ -153,7 +154,38 @@ BENCHMARK_TRAINING = Walk(
     without_figures(training, watch_updates),
 )
 
-WALKS = (BENCHMARK_META, BENCHMARK_RETRIEVAL, BENCHMARK_SIM, BENCHMARK_TRAINING)
+
+def watch_inner_loops(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    def median_ms(ways, repeats):
+        seen.append((sorted(ways), repeats, torch.get_num_threads()))
+        result = ways['early stopping']()
+        seen.append((result.train_losses, result.test_losses))
+        return dict.fromkeys(ways, 1.0)
+
+    patch.setattr(inner_loop, 'median_ms', median_ms)
+
+
+BENCHMARK_INNER_LOOP = Walk(
+    'benchmark inner-loop',
+    {'sizes': [[4, 1, 8]], 'steps': 2},
+    {
+        'out': 'elsewhere.json',
+        'sizes': [[4, 1, 9]],
+        'steps': 3,
+        'test_rows': 1,
+        'threads': 2,
+        'repeats': 4,
+    },
+    without_figures(inner_loop, watch_inner_loops),
+)
+
+WALKS = (
+    BENCHMARK_INNER_LOOP,
+    BENCHMARK_META,
+    BENCHMARK_RETRIEVAL,
+    BENCHMARK_SIM,
+    BENCHMARK_TRAINING,
+)
 
 
 @walks_through(WALKS)

@@ -84,7 +84,7 @@ SUCCESS_CURVE = Walk(
         **EVALUATION,
         'runs': ['@run-b'],
         'actor_loss': Proof('awr', CRITIC_RUN),
-        **under('ttt', TTT, actor_only=CRITIC_RUN),
+        **under('ttt', TTT, actor_only=CRITIC_RUN, engine=CRITIC_RUN),
         **under('filter', FILTER, min_steps=CRITIC_RUN),
     },
     watch_evaluation,

@@ -278,6 +278,8 @@ INNER_LOOP: dict[str, Any] = {
     'test_fraction': Proof(0.6, {'early_stopping': True}),
     'max_test': Proof(1, {'early_stopping': True}),
     'actor_only': True,  # of an agent with a critic
+    'engine': 'eager',
+    'precision': 'bfloat16',
     'fix_actor_goal': 0.3,
     'ratio': 0.3,
 }

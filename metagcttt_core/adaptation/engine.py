@@ -1,0 +1,135 @@
+"""What computes the gradient steps of the inner loop, and which an agent gets."""
+
+from collections.abc import Sequence
+from typing import Literal, Protocol
+
+import torch
+from torch import nn, Tensor
+
+from metagcttt_core.adaptation.config import EngineName
+from metagcttt_core.agents.agent import Agent, TensorBatch
+from metagcttt_core.agents.analytic import AnalyticLoss
+from metagcttt_core.training.config import Precision
+from metagcttt_core.training.numerics import resolve_precision
+from metagcttt_core.training.step import gradient_step
+
+
+class Engine(Protocol):
+    """Gradient steps on the weights of one agent.
+
+    Attributes:
+        name: `analytic` or `eager`.
+    """
+
+    name: str
+
+    def step(self, batch: TensorBatch) -> tuple[Tensor, dict[str, Tensor]]:
+        """Take a step; the loss before it and its parts, detached."""
+
+    def test_loss(self, batch: TensorBatch) -> Tensor:
+        """The loss of a held-out batch."""
+
+
+class EagerEngine:
+    """The loss and its gradient by autograd, for any agent on any device."""
+
+    name = 'eager'
+
+    def __init__(
+        self,
+        agent: Agent,
+        optimizer: torch.optim.Optimizer,
+        parameters: Sequence[nn.Parameter],
+        *,
+        actor_only: bool,
+        precision: Literal['float32', 'bfloat16'] = 'float32',
+    ) -> None:
+        """Step `parameters` of `agent` with `optimizer`; `bfloat16` is autocast."""
+        self._agent, self._optimizer, self._parameters = agent, optimizer, parameters
+        self._actor_only = actor_only
+        self._autocasts = precision == 'bfloat16'
+
+    def step(self, batch: TensorBatch) -> tuple[Tensor, dict[str, Tensor]]:
+        """See `Engine`."""
+        return gradient_step(
+            self._agent,
+            self._optimizer,
+            self._parameters,
+            batch,
+            losses=self._losses,
+            actor_only=self._actor_only,
+        )
+
+    @torch.no_grad()
+    def test_loss(self, batch: TensorBatch) -> Tensor:
+        """See `Engine`."""
+        return self._losses(batch)[0]
+
+    def _losses(self, batch: TensorBatch) -> tuple[Tensor, dict[str, Tensor]]:
+        with torch.autocast(self._agent.device.type, torch.bfloat16, enabled=self._autocasts):
+            return self._agent.losses(batch, actor_only=self._actor_only)
+
+
+class AnalyticEngine:
+    """The loss with its gradient written out, which spares autograd and slow products."""
+
+    name = 'analytic'
+
+    def __init__(
+        self,
+        agent: Agent,
+        optimizer: torch.optim.Optimizer,
+        parameters: Sequence[nn.Parameter],
+        loss: AnalyticLoss,
+        test_loss: AnalyticLoss,
+        *,
+        actor_only: bool,
+    ) -> None:
+        """Step as `EagerEngine`; the two losses of `agent` each work in their own memory."""
+        self._agent, self._optimizer = agent, optimizer
+        self._loss, self._test_loss = loss, test_loss
+        self._actor_only = actor_only
+        for parameter, gradient in zip(parameters, loss.gradients, strict=True):
+            parameter.grad = gradient
+
+    def step(self, batch: TensorBatch) -> tuple[Tensor, dict[str, Tensor]]:
+        """See `Engine`."""
+        loss, parts = self._loss(batch)
+        if not self._actor_only:
+            self._agent.update_targets()
+        self._optimizer.step()
+        return loss, parts
+
+    def test_loss(self, batch: TensorBatch) -> Tensor:
+        """See `Engine`."""
+        return self._test_loss(batch, backward=False)[0]
+
+
+def make_engine(
+    name: EngineName,
+    agent: Agent,
+    optimizer: torch.optim.Optimizer,
+    parameters: Sequence[nn.Parameter],
+    *,
+    actor_only: bool = False,
+    precision: Precision = 'float32',
+) -> Engine:
+    """The engine of that name for the gradient steps of `agent`.
+
+    Args:
+        name: `auto` is the analytic one where the agent has such a loss, else the eager one.
+        agent: What to train, in place.
+        optimizer: Steps `parameters`.
+        parameters: `agent.trained_parameters`.
+        actor_only: Train the actor and leave the rest.
+        precision: Of the matrix products; weights, optimiser and sums are float32.
+    """
+    resolved = resolve_precision(precision, agent)
+    if name == 'auto':
+        dtype = torch.bfloat16 if resolved == 'bfloat16' else torch.float32
+        losses = [agent.analytic_loss(actor_only=actor_only, dtype=dtype) for _ in range(2)]
+        if losses[0] is not None and losses[1] is not None:
+            return AnalyticEngine(
+                agent, optimizer, parameters, losses[0], losses[1], actor_only=actor_only
+            )
+    return EagerEngine(agent, optimizer, parameters, actor_only=actor_only, precision=resolved)

@@ -1,0 +1,58 @@
+"""Losses with gradients written out, which the inner loop takes where an agent has them."""
+
+from abc import ABC, abstractmethod
+import math
+
+import torch
+from torch import Tensor
+
+from metagcttt_core.agents.agent import Agent, TensorBatch
+from metagcttt_core.agents.passes import Passes
+
+HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
+
+
+class AnalyticLoss(ABC):
+    """An agent's loss and its gradient without autograd: `Agent.losses`, to rounding.
+
+    Attributes:
+        gradients: Those of the last call, one for each trained parameter; kept in the same memory.
+    """
+
+    gradients: list[Tensor]
+
+    @abstractmethod
+    def __call__(
+        self, batch: TensorBatch, *, backward: bool = True
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss of a batch and its named parts; sets `gradients` unless told otherwise."""
+
+
+class Cloning(AnalyticLoss):
+    """Negative log-likelihood of the actions with unit standard deviation, of GCBC."""
+
+    def __init__(self, agent: Agent, dtype: torch.dtype) -> None:
+        """The loss of `agent`, with matrix products in `dtype`."""
+        self.actor = Passes(agent.actor, dtype=dtype)
+        self.gradients = self.actor.gradients
+
+    @torch.no_grad()
+    def __call__(
+        self, batch: TensorBatch, *, backward: bool = True
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """See `AnalyticLoss`."""
+        error, _ = self.error(batch)
+        loss, mse = cloning_loss(error), error.square().mean()
+        if backward:
+            self.actor.backward(error.div_(len(error)))
+        return loss, {'bc': loss, 'mse': mse}
+
+    def error(self, batch: TensorBatch) -> tuple[Tensor, Tensor]:
+        """The policy's means minus the actions, and the means, each (B, act_dim)."""
+        mean = self.actor.forward(torch.cat([batch['observations'], batch['actor_goals']], dim=-1))
+        return mean - batch['actions'], mean
+
+
+def cloning_loss(error: Tensor) -> Tensor:
+    """The mean of -log pi over a batch whose means err by `error` (B, act_dim)."""
+    return error.square().sum(-1).mul_(0.5).mean() + error.shape[1] * HALF_LOG_TWO_PI
