@@ -7,7 +7,6 @@ from torch.profiler import record_function
 
 from metagcttt_core.agents.agent import Agent, TensorBatch
 from metagcttt_core.data.dataset import TrajectoryDataset
-from metagcttt_core.data.relabel import GoalRelabeller
 
 BATCHES = 'batches'
 """Name of the range that `torch.profiler` sees."""
@@ -40,7 +39,7 @@ class QueryBatches:
         """
         self.rows = rows[~dataset.terminals[rows]]
         self._agent = agent
-        self._relabeller = GoalRelabeller(dataset, agent.settings.goals, agent.settings.discount)
+        self._relabeller = agent.relabeller(dataset)
         self._goal = np.asarray(goal, dtype=np.float32)
         self._fix_actor_goal = fix_actor_goal
         self._ratio = ratio
@@ -92,5 +91,5 @@ class QueryBatches:
     def _gather(self, drawn: dict[str, np.ndarray]) -> TensorBatch:
         fixed = drawn.pop('fixed')
         batch = self._relabeller.gather(**drawn)
-        batch['actor_goals'][fixed] = self._goal
+        self._relabeller.fix_actor_goals(batch, fixed, self._goal)
         return self._agent.tensors(batch)

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from metagcttt_core.agents.gcbc import GCBC
     from metagcttt_core.agents.gciql import GCIQL
     from metagcttt_core.agents.registry import AGENTS, make_agent
+    from metagcttt_core.agents.saw import SAW
 else:
     __getattr__ = exports(
         __name__,
@@ -19,6 +20,7 @@ else:
             'gcbc': ('GCBC',),
             'gciql': ('GCIQL',),
             'registry': ('AGENTS', 'make_agent'),
+            'saw': ('SAW',),
         },
     )
 
@@ -26,6 +28,7 @@ __all__ = [
     'AGENTS',
     'GCBC',
     'GCIQL',
+    'SAW',
     'Agent',
     'AgentName',
     'AgentSettings',

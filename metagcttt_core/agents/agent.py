@@ -13,6 +13,8 @@ from torch import nn, Tensor
 
 from metagcttt_core.agents.config import AgentSettings
 from metagcttt_core.agents.networks import MLP
+from metagcttt_core.data.dataset import TrajectoryDataset
+from metagcttt_core.data.relabel import GoalRelabeller
 
 if TYPE_CHECKING:
     from metagcttt_core.agents.analytic import AnalyticLoss
@@ -38,6 +40,10 @@ class Agent(nn.Module, ABC):
 
     name: ClassVar[str]
     settings_type: ClassVar[type[AgentSettings]]
+    plain_policy: ClassVar[str] = 'actor'
+    """The network from [s; g] to means of actions, which tells the agent's widths."""
+    reference_networks: ClassVar[Mapping[str, tuple[str, ...]]] = {'modules_actor': ('actor',)}
+    """The networks under OGBench's names; several where OGBench stacks them along an axis."""
 
     def __init__(
         self, obs_dim: int, act_dim: int, settings: AgentSettings, generator: torch.Generator
@@ -53,16 +59,26 @@ class Agent(nn.Module, ABC):
         self.metadata: dict[str, Any] = {}
         self.optimizer_state: OptimizerState | None = None
         self.origin = 'the agent'
-        self.actor = MLP(
-            2 * obs_dim,
-            settings.hidden,
-            act_dim,
-            head='mean',
-            head_scale=0.01,
-            generator=generator,
+        self.actor = self.make_actor(generator)
+
+    def make_actor(self, generator: torch.Generator) -> MLP:
+        """A fresh policy network: [s; g] (..., 2 obs_dim) -> means of actions (..., act_dim)."""
+        return self.with_stds(
+            MLP(
+                2 * self.obs_dim,
+                self.settings.hidden,
+                self.act_dim,
+                head='mean',
+                head_scale=0.01,
+                generator=generator,
+            )
         )
-        if not settings.const_std:
-            self.actor.register_parameter('log_stds', nn.Parameter(torch.zeros(act_dim)))
+
+    def with_stds(self, policy: MLP) -> MLP:
+        """`policy` with log standard deviations of its own, if they are learned."""
+        if not self.settings.const_std:
+            policy.register_parameter('log_stds', nn.Parameter(torch.zeros(self.act_dim)))
+        return policy
 
     @abstractmethod
     def losses(
@@ -94,6 +110,10 @@ class Agent(nn.Module, ABC):
         """V(observations (n, obs_dim), goal (obs_dim,)) -> (n,), or None without a critic."""
         return None
 
+    def relabeller(self, dataset: TrajectoryDataset) -> GoalRelabeller:
+        """The source of batches that `losses` takes."""
+        return GoalRelabeller(dataset, self.settings.goals, self.settings.discount)
+
     def trained_parameters(self, *, actor_only: bool = False) -> Iterator[nn.Parameter]:
         """The parameters an optimiser steps on."""
         module = self.actor if actor_only else self
@@ -116,16 +136,18 @@ class Agent(nn.Module, ABC):
         self, observations: Tensor, goals: Tensor, actions: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Log-density of actions under the policy, (B,), and the policy's means, (B, act_dim)."""
-        mean = self.actor(torch.cat([observations, goals], dim=-1))
+        return self.log_prob_of(self.actor, observations, goals, actions)
+
+    def log_prob_of(
+        self, policy: nn.Module, observations: Tensor, goals: Tensor, actions: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """As `log_prob`, of another policy network than the actor."""
+        mean = policy(torch.cat([observations, goals], dim=-1))
         error = actions - mean
         if self.settings.const_std:
             return (-0.5 * error.square() - _HALF_LOG_TWO_PI).sum(-1), mean
-        log_std = self._log_std()
+        log_std = log_std_of(policy)
         return (-0.5 * (error / log_std.exp()).square() - log_std - _HALF_LOG_TWO_PI).sum(-1), mean
-
-    def _log_std(self) -> Tensor:
-        # Not by `get_parameter`: `functional_call` puts plain tensors in the parameters' places.
-        return dict(self.actor.named_parameters())['log_stds'].clamp(-5, 2)
 
     @torch.inference_mode()
     def act(
@@ -163,7 +185,7 @@ class Agent(nn.Module, ABC):
         if temperature > 0:
             if rng is None:
                 raise ValueError('acting with a temperature above 0 needs an rng')
-            std = 1.0 if self.settings.const_std else self._log_std().exp().cpu().numpy()
+            std = 1.0 if self.settings.const_std else log_std_of(self.actor).exp().cpu().numpy()
             mean = mean + temperature * std * rng.standard_normal(mean.shape, dtype=np.float32)
         return np.clip(mean, -1, 1)
 
@@ -229,6 +251,12 @@ class Agent(nn.Module, ABC):
             array = tensor.cpu().numpy().copy()
             exported[name] = array.T if name.endswith('.kernel') else array
         return exported
+
+
+def log_std_of(policy: nn.Module) -> Tensor:
+    """Log standard deviations of a policy that learns them, (act_dim,)."""
+    # Not by `get_parameter`: `functional_call` puts plain tensors in the parameters' places.
+    return dict(policy.named_parameters())['log_stds'].clamp(-5, 2)
 
 
 def _reference_name(name: str, tensor: Tensor) -> str:

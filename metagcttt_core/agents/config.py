@@ -56,9 +56,27 @@ class GCIQLOptions(AgentOptions):
     tau: float = Field(0.005, gt=0, le=1, description='rate of the target critics')
 
 
+class SAWOptions(AgentOptions):
+    """Options of SAW; the defaults are those of the authors' code (impls/agents/saw.py)."""
+
+    expectile: float = Field(0.7, gt=0, lt=1, description='of the value regression')
+    tau: float = Field(0.005, gt=0, le=1, description='rate of the target values')
+    subgoal_steps: int = Field(25, ge=1, description='most steps to a waypoint')
+    alpha: float = Field(3.0, ge=0, description='inverse temperature of the advantages of actions')
+    subpolicy_alpha: float = Field(3.0, ge=0, description='the same, for the sub-policy')
+    waypoint_alpha: float = Field(
+        3.0, ge=0, description='inverse temperature of the advantages of waypoints'
+    )
+    rep_dim: int = Field(10, ge=1, description='width of the goal representations')
+
+
 class GCBCSettings(GCBCOptions, AgentSettings):
     """All settings of GCBC."""
 
 
 class GCIQLSettings(GCIQLOptions, AgentSettings):
     """All settings of GCIQL."""
+
+
+class SAWSettings(SAWOptions, AgentSettings):
+    """All settings of SAW."""

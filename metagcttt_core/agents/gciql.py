@@ -1,10 +1,8 @@
 """Goal-conditioned implicit Q-learning (paper, section 3.1, equations 3 and 4)."""
 
-from dataclasses import dataclass
-import hashlib
+from collections.abc import Mapping
 from typing import ClassVar, TYPE_CHECKING
 
-import numpy as np
 import torch
 from torch import nn, Tensor
 from torch.func import functional_call
@@ -12,6 +10,7 @@ from torch.func import functional_call
 from metagcttt_core.agents.agent import Agent, TensorBatch
 from metagcttt_core.agents.config import AgentSettings, GCIQLSettings
 from metagcttt_core.agents.networks import MLP
+from metagcttt_core.agents.state_value import StateValue
 
 if TYPE_CHECKING:
     from metagcttt_core.agents.analytic import AnalyticLoss
@@ -23,6 +22,12 @@ class GCIQL(Agent):
     name: ClassVar[str] = 'gciql'
     settings_type: ClassVar[type[AgentSettings]] = GCIQLSettings
     settings: GCIQLSettings
+    reference_networks: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        **Agent.reference_networks,
+        'modules_value': ('value',),
+        'modules_critic': ('critic1', 'critic2'),
+        'modules_target_critic': ('target1', 'target2'),
+    }
 
     def __init__(
         self, obs_dim: int, act_dim: int, settings: GCIQLSettings, generator: torch.Generator
@@ -119,37 +124,14 @@ class GCIQL(Agent):
             for trailing, weight in zip(target.parameters(), critic.parameters(), strict=True):
                 trailing.lerp_(weight, self.settings.tau)
 
+    def state_value(self, observations: Tensor, goals: Tensor) -> Tensor:
+        """V(s, g) of observations and goals (B, obs_dim), (B,)."""
+        return self.value(_join(observations, goals)).squeeze(-1)
+
     @property
-    def value_fn(self) -> 'StateValue':
+    def value_fn(self) -> StateValue:
         """V(observations (n, obs_dim), goal (obs_dim,)) -> (n,) float32."""
-        return StateValue(self, self._value_digest())
-
-    def _value_digest(self) -> bytes:
-        digest = hashlib.blake2b(digest_size=16)
-        for weight in self.value.parameters():
-            digest.update(weight.detach().cpu().numpy().data)
-        return digest.digest()
-
-
-@dataclass(frozen=True)
-class StateValue:
-    """V of an agent with the weights it has now; equal only while the weights stay the same.
-
-    Attributes:
-        agent: Whose value network to evaluate.
-        digest: Of those weights.
-    """
-
-    agent: GCIQL
-    digest: bytes
-
-    @torch.inference_mode()
-    def __call__(self, observations: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """V(observations (n, obs_dim) | goal (obs_dim,)), (n,) float32."""
-        device = self.agent.device
-        states = torch.from_numpy(np.asarray(observations, np.float32)).to(device)
-        goals = torch.from_numpy(np.asarray(goal, np.float32)).to(device).expand_as(states)
-        return self.agent.value(_join(states, goals)).squeeze(-1).cpu().numpy()
+        return StateValue.of(self, self.value)
 
 
 def _join(*parts: Tensor) -> Tensor:

@@ -50,6 +50,46 @@ class MLP(nn.Module):
         return self.get_submodule(self.head_name)(x).to(inputs.dtype)
 
 
+class GoalRepresentation(MLP):
+    """phi([s; g]) of length sqrt(width): a layer-normed MLP, its output normalised."""
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Map [s; g] (..., 2 obs_dim) to (..., width)."""
+        output = functional.normalize(super().forward(inputs), dim=-1)
+        return output * math.sqrt(output.shape[-1])
+
+
+class RepresentedGoalPolicy(MLP):
+    """Means of actions from a state and its own representation of state and goal."""
+
+    def __init__(
+        self,
+        obs_dim: int,
+        hidden: tuple[int, ...],
+        act_dim: int,
+        rep_dim: int,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        """Build the policy's layers and `goal_rep`."""
+        super().__init__(
+            obs_dim + rep_dim,
+            hidden,
+            act_dim,
+            head='mean',
+            head_scale=0.01,
+            generator=generator,
+        )
+        self.obs_dim = obs_dim
+        self.goal_rep = GoalRepresentation(
+            2 * obs_dim, hidden, rep_dim, layer_norm=True, generator=generator
+        )
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Map [s; g] (..., 2 obs_dim) to (..., act_dim)."""
+        states = inputs[..., : self.obs_dim]
+        return super().forward(torch.cat([states, self.goal_rep(inputs)], dim=-1))
+
+
 def _linear(
     fan_in: int, fan_out: int, scale: float, generator: torch.Generator | None
 ) -> nn.Linear:

@@ -16,6 +16,7 @@ AGENTS: Registry[type[Agent]] = Registry(
     {
         'gcbc': 'metagcttt_core.agents.gcbc:GCBC',
         'gciql': 'metagcttt_core.agents.gciql:GCIQL',
+        'saw': 'metagcttt_core.agents.saw:SAW',
     },
 )
 

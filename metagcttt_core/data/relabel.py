@@ -51,15 +51,25 @@ class GoalRelabeller:
     """Draws transitions and goals for them from a dataset."""
 
     def __init__(
-        self, dataset: TrajectoryDataset, config: GoalConfig, discount: float = 0.99
+        self,
+        dataset: TrajectoryDataset,
+        config: GoalConfig,
+        discount: float = 0.99,
+        *,
+        subgoal_steps: int | None = None,
     ) -> None:
         """Draw from `dataset` by the distributions of `config`.
 
-        `discount` shapes geometric goals: P(k) = (1 - discount) discount^(k-1).
+        Args:
+            dataset: Where transitions and goals come from.
+            config: Distributions of the goals.
+            discount: Shapes geometric goals: P(k) = (1 - discount) discount^(k-1).
+            subgoal_steps: Steps to the waypoints in the batches; none by default.
         """
         self.dataset = dataset
         self.config = config
         self.discount = discount
+        self.subgoal_steps = subgoal_steps
 
     def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:
         """A batch of uniformly drawn transitions, relabelled; see `relabel` for its keys."""
@@ -77,7 +87,9 @@ class GoalRelabeller:
             `actor_goals` (B, obs_dim), `actions` (B, act_dim), `rewards`, `masks` (B,). The
             reward is 0 and the mask 0 where the value goal is the row itself, else -1 and 1 (with
             `gc_negative`). Without value goals in the config, only `observations`, `actions` and
-            `actor_goals`.
+            `actor_goals`. With `subgoal_steps` also `subgoals` and `waypoints` (B, obs_dim): the
+            states that many steps later, or at the end of the trajectory, and the same but no
+            later than the actor goal, if that lies ahead on the trajectory.
         """
         return self.gather(rows, **self.draw_goals(rows, rng))
 
@@ -110,7 +122,24 @@ class GoalRelabeller:
             batch['rewards'] = success - np.float32(self.config.gc_negative)
             batch['masks'] = 1 - success
         batch['actor_goals'] = data.observations[actor_rows]
+        if self.subgoal_steps is not None:
+            final = data.episode_ends[data.episode_of(rows)] - 1  # as in `goal_rows`
+            subgoals = np.minimum(rows + self.subgoal_steps, final)
+            ahead = (rows <= actor_rows) & (actor_rows <= final)
+            waypoints = np.where(ahead, np.minimum(subgoals, actor_rows), subgoals)
+            batch['subgoals'] = data.observations[subgoals]
+            batch['waypoints'] = data.observations[waypoints]
         return batch
+
+    @staticmethod
+    def fix_actor_goals(batch: Batch, fixed: np.ndarray, goal: np.ndarray) -> None:
+        """Set the actor goals of the transitions where `fixed` (..., B) to `goal` (obs_dim,).
+
+        Its way is not in the dataset, so their waypoints are the subgoals.
+        """
+        batch['actor_goals'][fixed] = goal
+        if 'waypoints' in batch:
+            batch['waypoints'][fixed] = batch['subgoals'][fixed]
 
     def goal_rows(
         self, rows: np.ndarray, goals: GoalDistribution, rng: np.random.Generator

@@ -8,7 +8,6 @@ import torch
 
 from metagcttt_core.agents.agent import Agent
 from metagcttt_core.data.dataset import TrajectoryDataset
-from metagcttt_core.data.relabel import GoalRelabeller
 from metagcttt_core.training.config import Precision, PretrainConfig
 from metagcttt_core.training.numerics import loss_function
 from metagcttt_core.training.optimizers import make_optimizer
@@ -45,7 +44,7 @@ def pretrain(
     """
     agent = agent.clone()
     run = run or TrainingRun('pretrain', {})
-    relabeller = GoalRelabeller(dataset, agent.settings.goals, agent.settings.discount)
+    relabeller = agent.relabeller(dataset)
     parameters = list(agent.trained_parameters())
     optimizer = make_optimizer('adam', parameters, config.lr)
     losses = loss_function(agent, precision=precision, compiled=compiled)

@@ -35,6 +35,36 @@ def as_ogbench_names(arrays):
     return renamed
 
 
+def as_names_of_saw(arrays):
+    """The arrays as the authors' SAW names and stacks them, from three hidden layers."""
+
+    def numbered(rest, head):
+        for index in range(3):
+            rest = rest.replace(f'fc{index}.', f'Dense_{index}.')
+            rest = rest.replace(f'ln{index}.', f'LayerNorm_{index}.')
+        return rest.replace('out.', head)
+
+    renamed = {}
+    for name, array in arrays.items():
+        net, _, rest = name.partition('.')
+        if net == 'value_rep':
+            renamed[f'modules_goal_rep.layers_0.{numbered(rest, "Dense_3.")}'] = array
+        elif rest.startswith('goal_rep.'):
+            inner = numbered(rest.removeprefix('goal_rep.'), 'Dense_3.')
+            renamed[f'modules_actor_goal_rep_def.layers_0.{inner}'] = array
+        elif net in ('actor', 'subpolicy'):
+            own = rest == 'log_stds' or rest.startswith('mean.')
+            inner = (
+                rest.replace('mean.', 'mean_net.') if own else f'actor_net.{numbered(rest, "")}'
+            )
+            renamed[f'modules_{"actor" if net == "actor" else "low_actor"}.{inner}'] = array
+        elif net.endswith('1'):
+            kind = {'value1': 'value', 'target1': 'target_value'}[net]
+            stacked = np.stack([array, arrays[f'{net[:-1]}2.{rest}']])
+            renamed[f'modules_{kind}.value_net.{numbered(rest, "Dense_3.")}'] = stacked
+    return renamed
+
+
 def save(path, arrays):
     np.savez(path, **arrays)
     return path
@@ -65,6 +95,18 @@ def test_exported_agent_comes_back_under_either_names(name, const_std, rename, t
     agent = tiny_agent(name, obs_dim=3, act_dim=2, hidden=(6, 5, 4), const_std=const_std)
     file = save(tmp_path / 'params.npz', rename(agent.export_reference_parameters()))
     convert_checkpoint.main([str(file), '--agent', name, '--out', str(tmp_path / 'converted')])
+    converted = load_checkpoint(tmp_path / 'converted')
+    assert_bit_equal(converted, weights_of(agent))
+    assert converted.settings == agent.settings
+    assert (converted.obs_dim, converted.act_dim) == (3, 2)
+
+
+@pytest.mark.parametrize('const_std', [True, False])
+@pytest.mark.parametrize('rename', [dict, as_names_of_saw])
+def test_exported_saw_comes_back_under_either_names(const_std, rename, tmp_path):
+    agent = tiny_agent('saw', obs_dim=3, act_dim=2, hidden=(6, 5, 4), const_std=const_std)
+    file = save(tmp_path / 'params.npz', rename(agent.export_reference_parameters()))
+    convert_checkpoint.main([str(file), '--agent', 'saw', '--out', str(tmp_path / 'converted')])
     converted = load_checkpoint(tmp_path / 'converted')
     assert_bit_equal(converted, weights_of(agent))
     assert converted.settings == agent.settings
@@ -119,7 +161,7 @@ def put(name, array):
         (
             'gciql',
             put('modules_critic.value_net.Dense_0.bias', np.zeros((3, 6))),
-            'Dense_0.bias must hold two critics along its first axis, got (3, 6)',
+            'Dense_0.bias must hold two networks along its first axis, got (3, 6)',
         ),
     ],
 )

@@ -8,7 +8,7 @@ import re
 from typing import Annotated, Any, TYPE_CHECKING
 
 from metagcttt_core import DatasetError
-from metagcttt_core.agents import AgentName
+from metagcttt_core.agents import AgentName, AGENTS
 from metagcttt_core.agents.config import ActorLoss
 from metagcttt_core.config import Settings
 from metagcttt_core.data.npz import read_arrays
@@ -27,13 +27,6 @@ Example: metagcttt convert params.npz --agent gciql --alpha 0.003
 The arrays have OGBench's names, joined by dots, as `np.savez('params.npz',
 **flax.traverse_util.flatten_dict(agent.network.params, sep='.'))` writes them, or ours:
 actor.fc0.kernel, value.ln0.scale, critic1.out.bias, ... Widths follow from the arrays."""
-
-_OGBENCH_NETS = {
-    'modules_actor': ('actor',),
-    'modules_value': ('value',),
-    'modules_critic': ('critic1', 'critic2'),
-    'modules_target_critic': ('target1', 'target2'),
-}
 
 
 class ConvertSettings(Settings):
@@ -101,12 +94,16 @@ def agent_from(arrays: Mapping[str, np.ndarray], name: AgentName, **settings: An
     """
     from metagcttt_core import make_agent
 
-    own = from_ogbench_names(arrays)
-    kernels = [own.get(f'actor.{layer}.kernel') for layer in (*_hidden_layers(own), 'mean')]
+    agent_type = AGENTS.find(name)
+    own = from_ogbench_names(arrays, agent_type.reference_networks)
+    policy = agent_type.plain_policy
+    layers = (*_hidden_layers(own, policy), 'mean')
+    kernels = [own.get(f'{policy}.{layer}.kernel') for layer in layers]
     if len(kernels) < 2 or any(kernel is None or kernel.ndim != 2 for kernel in kernels):
+        found = ', '.join(sorted(own)) or 'no arrays'
         raise ValueError(
-            'the actor needs kernels actor.fc0.kernel, actor.fc1.kernel, ..., actor.mean.kernel '
-            f'of two dimensions; found: {", ".join(sorted(own)) or "no arrays"}'
+            f'the {policy} needs kernels {policy}.fc0.kernel, {policy}.fc1.kernel, ..., '
+            f'{policy}.mean.kernel of two dimensions; found: {found}'
         )
     widths = [kernel.shape for kernel in kernels if kernel is not None]
     agent = make_agent(
@@ -121,41 +118,47 @@ def agent_from(arrays: Mapping[str, np.ndarray], name: AgentName, **settings: An
     return agent
 
 
-def _hidden_layers(arrays: Mapping[str, np.ndarray]) -> list[str]:
-    count = sum(bool(re.fullmatch(r'actor\.fc\d+\.kernel', name)) for name in arrays)
+def _hidden_layers(arrays: Mapping[str, np.ndarray], policy: str) -> list[str]:
+    count = sum(bool(re.fullmatch(rf'{policy}\.fc\d+\.kernel', name)) for name in arrays)
     return [f'fc{index}' for index in range(count)]
 
 
-def from_ogbench_names(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def from_ogbench_names(
+    arrays: Mapping[str, np.ndarray], networks: Mapping[str, tuple[str, ...]]
+) -> dict[str, np.ndarray]:
     """The arrays by our names; those that do not begin with `modules_` keep theirs.
 
-    OGBench stacks twin critics along a first axis and numbers a network's linear layers, the last
-    of which is the head.
+    OGBench stacks twin networks along a first axis and numbers a network's linear layers, the last
+    of which is the head, unless it is named.
+
+    Args:
+        arrays: By OGBench's names.
+        networks: Our networks by OGBench's names; see `Agent.reference_networks`.
     """
     renamed = {}
-    heads = {net: _last_dense(arrays, net) for net in _OGBENCH_NETS}
+    heads = {net: _last_dense(arrays, net) for net in networks}
     for name, array in arrays.items():
         net, _, rest = name.partition('.')
-        if net not in _OGBENCH_NETS:
+        if net not in networks:
             renamed[name] = array
             continue
-        rest = re.sub(r'^(actor_net|value_net)\.', '', rest).replace('mean_net.', 'mean.')
-        if net != 'modules_actor':
+        rest = re.sub(r'^(actor_net|value_net|layers_0)\.', '', rest).replace('mean_net.', 'mean.')
+        if f'{net}.mean_net.kernel' not in arrays:
             rest = rest.replace(f'Dense_{heads[net]}.', 'out.')
         rest = re.sub(r'^Dense_(\d+)\.', r'fc\1.', rest)
         rest = re.sub(r'^LayerNorm_(\d+)\.', r'ln\1.', rest)
-        targets = _OGBENCH_NETS[net]
+        targets = networks[net]
         if len(targets) == 1:
             renamed[f'{targets[0]}.{rest}'] = array
             continue
         if array.ndim == 0 or len(array) != len(targets):
             raise ValueError(
-                f'{name} must hold two critics along its first axis, got {array.shape}'
+                f'{name} must hold two networks along its first axis, got {array.shape}'
             )
         renamed |= {f'{target}.{rest}': part for target, part in zip(targets, array, strict=True)}
     return renamed
 
 
 def _last_dense(arrays: Mapping[str, np.ndarray], net: str) -> int | None:
-    pattern = re.compile(rf'{net}\.value_net\.Dense_(\d+)\.kernel')
+    pattern = re.compile(rf'{net}\.(?:value_net|layers_0)\.Dense_(\d+)\.kernel')
     return max((int(m[1]) for m in map(pattern.fullmatch, arrays) if m), default=None)

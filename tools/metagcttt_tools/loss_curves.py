@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from metagcttt_core import Agent
     from torch import Tensor
 
-_DESCRIPTION = """Draw the losses of test-time training by part: total, actor, critic, value.
+_DESCRIPTION = """Draw the losses of test-time training by part, such as actor and value.
 
 Example: metagcttt loss-curves --checkpoint out/base-0/checkpoint --lrs 1e-4 3e-4 3e-3
 The policy adapts to one task of its simulator with each learning rate. With --run FOLDER the
@@ -33,7 +33,7 @@ losses are those of a pre-training run, from its log. Writes OUT as JSON, a pict
 
 Curves = dict[str, dict[str, list[float]]]
 """By line and part of the loss, its values in order."""
-_PANELS = ('total', 'actor', 'critic', 'value')
+_PANELS = ('total', 'actor', 'subpolicy', 'critic', 'value')
 _SQUARED = ('critic', 'value')  # never negative, and over orders of magnitude
 
 

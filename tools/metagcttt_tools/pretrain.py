@@ -9,7 +9,7 @@ from typing import Annotated, Any, Self, TYPE_CHECKING
 
 from metagcttt_core import DatasetError, TrajectoryDataset
 from metagcttt_core.agents import AgentName, AGENTS
-from metagcttt_core.agents.config import GCBCOptions, GCIQLOptions
+from metagcttt_core.agents.config import GCBCOptions, GCIQLOptions, SAWOptions
 from metagcttt_core.plugins import PluginError
 from metagcttt_core.training.config import Precision, PretrainConfig
 from pydantic import create_model, Field, model_validator
@@ -47,6 +47,7 @@ class PretrainSettings(RunSettings):
     hidden: tuple[int, ...] = Field((512, 512, 512), description='units of each hidden layer')
     gcbc: Annotated[GCBCOptions, tyro.conf.AvoidSubcommands] = GCBCOptions()
     gciql: Annotated[GCIQLOptions, tyro.conf.AvoidSubcommands] = GCIQLOptions()
+    saw: Annotated[SAWOptions, tyro.conf.AvoidSubcommands] = SAWOptions()
     training: PretrainConfig = PretrainConfig()
     precision: Precision = Field(
         'float32', description='of matrix products; auto is bfloat16 where the device gains by it'

@@ -38,7 +38,7 @@ def pretraining_rows() -> list[dict[str, Any]]:
         rows[settings.dataset] = {
             'dataset': settings.dataset.stem,
             'agent': settings.agent,
-            'alpha': f'{agent.alpha:g}' if settings.agent == 'gciql' else '',
+            'alpha': f'{agent.alpha:g}' if hasattr(agent, 'alpha') else '',
             'discount': f'{agent.discount:g}',
             'random actor goals': f'{agent.goals.actor.p_randomgoal:g}',
             'hidden': ' '.join(map(str, settings.hidden)),

@@ -16,6 +16,7 @@ BACKBONES = pytest.mark.parametrize(
         ('gciql', {'actor_loss': 'bc'}),
         ('gciql', {'actor_loss': 'awr'}),
         ('gciql', {'actor_loss': 'ddpgbc'}),
+        ('saw', {}),
     ],
 )
 OPTIMIZERS = pytest.mark.parametrize(('optimizer', 'lr'), [('adam', 0.1), ('sgd', 0.1)])

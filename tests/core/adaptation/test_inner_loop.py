@@ -15,7 +15,7 @@ EVERY_AGENT = pytest.mark.parametrize('name', sorted(AGENTS))
 
 def batches_for(agent, count: int, size: int = 16, seed: int = 0):
     """Batches with all of OGBench's keys."""
-    rng = np.random.default_rng(seed)
+    rng, states = np.random.default_rng(seed), np.random.default_rng((seed, 1))
     masks = rng.integers(0, 2, size=(count, size)).astype(np.float32)
     return [
         agent.tensors(
@@ -27,6 +27,8 @@ def batches_for(agent, count: int, size: int = 16, seed: int = 0):
                 'actions': rng.uniform(-1, 1, size=(size, 2)).astype(np.float32),
                 'rewards': masks[number] * -1,
                 'masks': masks[number],
+                'subgoals': states.normal(size=(size, 2)).astype(np.float32),
+                'waypoints': states.normal(size=(size, 2)).astype(np.float32),
             }
         )
         for number in range(count)

@@ -13,6 +13,7 @@ BACKBONES = [
     ('gciql', {'actor_loss': 'bc'}),
     ('gciql', {'actor_loss': 'awr'}),
     ('gciql', {'actor_loss': 'ddpgbc'}),
+    ('saw', {}),
 ]
 
 
@@ -61,8 +62,12 @@ def test_meta_batch_adapted_together_gives_the_policy_of_one_by_one(
     assert max(best_steps[0]) > 0
     for key, weight in trained[0].items():
         torch.testing.assert_close(weight, trained[1][key], rtol=1e-3, atol=1e-4)
-    critics = {'value', 'critic1', 'critic2', 'target1', 'target2'}
-    changed = {'actor'} | (critics if name == 'gciql' and not actor_only else set())
+    others = {
+        'gcbc': set(),
+        'gciql': {'value', 'critic1', 'critic2', 'target1', 'target2'},
+        'saw': {'subpolicy', 'value_rep', 'value1', 'value2', 'target1', 'target2'},
+    }
+    changed = {'actor'} | (set() if actor_only else others[name])
     assert moved(weights_of(agent), trained[0]) == changed
 
 

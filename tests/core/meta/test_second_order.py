@@ -19,7 +19,7 @@ def batches(count, seed=0, dtype=torch.float64):
     made = []
     for _ in range(count):
         batch = {key: torch.tensor(rng.normal(size=(5, 2)), dtype=dtype) for key in ACTOR_KEYS}
-        for key in ('next_observations', 'value_goals'):
+        for key in ('next_observations', 'value_goals', 'subgoals', 'waypoints'):
             batch[key] = torch.tensor(rng.normal(size=(5, 2)), dtype=dtype)
         batch['rewards'] = torch.tensor([-1.0, -1, 0, -1, 0], dtype=dtype)
         batch['masks'] = -batch['rewards']
@@ -57,7 +57,7 @@ def test_gradient_equals_finite_differences(const_std, optimizer, num_steps):
             assert gradient.view(-1)[index].item() == pytest.approx(slope, rel=2e-4, abs=1e-6)
 
 
-@pytest.mark.parametrize('name', ['gcbc', 'gciql'])
+@pytest.mark.parametrize('name', ['gcbc', 'gciql', 'saw'])
 @pytest.mark.parametrize('optimizer', ['sgd', 'adam'])
 def test_without_the_second_order_term_it_is_fomaml(name, optimizer):
     agent = tiny_agent(name).double()

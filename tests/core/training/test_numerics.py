@@ -3,7 +3,6 @@
 from types import SimpleNamespace
 
 from metagcttt_core import make_agent
-from metagcttt_core.data import GoalRelabeller
 from metagcttt_core.training import numerics
 from metagcttt_core.training.numerics import loss_function, resolve_precision
 from metagcttt_core.training.pretrain import pretrain, PretrainConfig
@@ -18,14 +17,15 @@ LEARNERS = pytest.mark.parametrize(
     [
         ('gcbc', {}),
         *(('gciql', {'actor_loss': loss, 'alpha': 0.1}) for loss in ('bc', 'awr', 'ddpgbc')),
+        ('saw', {}),
     ],
 )
 
 
 def agent_and_batch(name, settings, hidden=(32, 32)):
     agent = tiny_agent(name, hidden=hidden, **settings)
-    relabeller = GoalRelabeller(random_dataset([40]), agent.settings.goals)
-    return agent, agent.tensors(relabeller.sample(128, np.random.default_rng(0)))
+    batch = agent.relabeller(random_dataset([40])).sample(128, np.random.default_rng(0))
+    return agent, agent.tensors(batch)
 
 
 def gradients(agent, losses, batch):
@@ -110,7 +110,7 @@ def test_compiled_code_is_made_for_the_number_of_threads(monkeypatch):
     assert asked[0]['cpp.threads'] == 3
 
 
-@pytest.mark.parametrize('name', ['gcbc', 'gciql'])
+@pytest.mark.parametrize('name', ['gcbc', 'gciql', 'saw'])
 def test_pretraining_in_bfloat16_repeats_to_the_bit_and_keeps_float32_weights(name):
     agent = make_agent(name, obs_dim=2, act_dim=2, hidden=(16, 16))
     config = PretrainConfig(steps=3, batch_size=16)

@@ -60,6 +60,7 @@ def goals(place: str, **given: str) -> dict[str, Proof]:
 
 
 GCIQL = {'agent': 'gciql'}
+SAW = {'agent': 'saw'}
 GEOMETRIC = {'gcbc.goals.actor.geometric': True}
 PRETRAIN = Walk(
     'pretrain',
@@ -97,6 +98,18 @@ PRETRAIN = Walk(
         'gciql.alpha': Proof(3.0, GCIQL),
         'gciql.expectile': Proof(0.6, GCIQL),
         'gciql.tau': Proof(0.5, GCIQL),
+        'saw.const_std': Proof(False, SAW),
+        'saw.discount': Proof(0.5, SAW),
+        **goals('saw.goals.value', **SAW),
+        **goals('saw.goals.actor', **SAW),
+        'saw.goals.gc_negative': Proof(False, SAW),
+        'saw.expectile': Proof(0.6, SAW),
+        'saw.tau': Proof(0.5, SAW),
+        'saw.subgoal_steps': Proof(2, SAW),
+        'saw.alpha': Proof(1.0, SAW),
+        'saw.subpolicy_alpha': Proof(1.0, SAW),
+        'saw.waypoint_alpha': Proof(1.0, SAW),
+        'saw.rep_dim': Proof(4, SAW),
         'training.steps': 2,
         'training.lr': 0.01,
         'training.batch_size': 9,

@@ -29,7 +29,7 @@ from metagcttt_tools.common.results import Benchmark, markdown_table, write_repo
 if TYPE_CHECKING:
     from metagcttt_core import Agent
 
-_DESCRIPTION = """Cost of a step of the inner loop: engines and precisions beside bare products and JAX.
+_DESCRIPTION = """Cost of an inner step: engines and precisions, bare products and JAX.
 
 Example: metagcttt benchmark inner-loop
 Prints a table and writes JSON. JAX takes the extra `jax`, and steps GCBC alone."""

@@ -11,6 +11,7 @@ import tempfile
 from typing import Any, Literal, TYPE_CHECKING
 
 from metagcttt_core import TrajectoryDataset
+from metagcttt_core.agents import AgentName
 from metagcttt_core.config import assets_dir
 import numpy as np
 from pydantic import Field
@@ -51,7 +52,7 @@ class RosBenchmark(Benchmark):
         2.0, gt=0, description='while adapting, a new goal supersedes the last, seconds'
     )
     rate_hz: float = Field(50.0, gt=0, le=1000, description='states per second')
-    agent: Literal['gcbc', 'gciql'] = Field('gcbc', description='kind of policy')
+    agent: AgentName = Field('gcbc', description='kind of policy')
     hidden: tuple[int, ...] = Field((512, 512, 512), description='units of its networks')
     steps: tuple[int, ...] = Field((1, 10, 50, 100), description='K: gradient steps per goal')
     repeats: int = Field(5, ge=1, description='goals per K')

@@ -46,6 +46,7 @@ class Learner(NamedTuple):
 LEARNERS = (
     Learner('gcbc', {}),
     *(Learner('gciql', {'actor_loss': loss}) for loss in ('bc', 'awr', 'ddpgbc')),
+    Learner('saw', {}),
 )
 
 
@@ -61,7 +62,7 @@ def main(argv: list[str] | None = None) -> None:
 
 
 class TrainingBenchmark(Benchmark):
-    """Milliseconds per update of GCBC and GCIQL beside the matrix products of the same step."""
+    """Milliseconds per update of each agent beside the matrix products of the same step."""
 
     out: Path = Field(Path('out/benchmark/training.json'), description='file for the results')
     sizes: tuple[tuple[int, int, int], ...] = Field(

@@ -9,7 +9,6 @@ from metagcttt_core import (
     evaluate_success,
     TrajectoryDataset,
 )
-from metagcttt_core.data import GoalRelabeller
 from metagcttt_core.training.config import Precision
 from metagcttt_core.training.numerics import loss_function
 import numpy as np
@@ -32,8 +31,8 @@ class Validation:
         """The agent's losses on one batch, which the seed and the step decide."""
         if self._dataset is None:
             return {}
-        relabeller = GoalRelabeller(self._dataset, agent.settings.goals, agent.settings.discount)
-        batch = relabeller.sample(self._batch_size, np.random.default_rng((seed, step, 1)))
+        rng = np.random.default_rng((seed, step, 1))
+        batch = agent.relabeller(self._dataset).sample(self._batch_size, rng)
         with no_grad():
             loss, parts = loss_function(agent, precision=self._precision)(agent.tensors(batch))
         return {'val/loss': float(loss)} | {f'val/{k}': float(part) for k, part in parts.items()}

@@ -1,0 +1,50 @@
+"""The value function of an agent as the retrieval takes it, with the weights it has now."""
+
+from dataclasses import dataclass
+import hashlib
+from typing import Protocol, Self
+
+import numpy as np
+import torch
+from torch import nn, Tensor
+
+
+class ValueAgent(Protocol):
+    """An agent that has a value function."""
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the weights."""
+
+    def state_value(self, observations: Tensor, goals: Tensor) -> Tensor:
+        """V(s, g) of observations and goals (B, obs_dim), (B,)."""
+
+
+@dataclass(frozen=True)
+class StateValue:
+    """V of an agent with the weights it has now; equal only while the weights stay the same.
+
+    Attributes:
+        agent: Whose value to evaluate.
+        digest: Of the weights that it depends on.
+    """
+
+    agent: ValueAgent
+    digest: bytes
+
+    @classmethod
+    def of(cls, agent: ValueAgent, *networks: nn.Module) -> Self:
+        """The value of `agent`, which depends on the weights of `networks`."""
+        digest = hashlib.blake2b(digest_size=16)
+        for network in networks:
+            for weight in network.parameters():
+                digest.update(weight.detach().cpu().numpy().data)
+        return cls(agent, digest.digest())
+
+    @torch.inference_mode()
+    def __call__(self, observations: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """V(observations (n, obs_dim) | goal (obs_dim,)), (n,) float32."""
+        device = self.agent.device
+        states = torch.from_numpy(np.asarray(observations, np.float32)).to(device)
+        goals = torch.from_numpy(np.asarray(goal, np.float32)).to(device).expand_as(states)
+        return self.agent.state_value(states, goals).cpu().numpy()
