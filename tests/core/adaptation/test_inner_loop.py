@@ -112,10 +112,11 @@ def test_no_batches_give_the_base_weights():
 @EVERY_AGENT
 def test_early_stopping_keeps_the_weights_of_the_smallest_test_loss(name):
     base = tiny_agent(name)
+    lr = 0.05 if name == 'saw' else 0.6  # at which the test loss rises in the end
     batches, (test_batch,) = batches_for(base, 12), batches_for(base, 1, seed=9)
-    result = run_inner_loop(base, batches, lr=0.6, test_batch=test_batch)
+    result = run_inner_loop(base, batches, lr=lr, test_batch=test_batch)
     # The loss of every intermediate agent, by running each number of steps on its own.
-    agents = [run_inner_loop(base, batches[:steps], lr=0.6).agent for steps in range(13)]
+    agents = [run_inner_loop(base, batches[:steps], lr=lr).agent for steps in range(13)]
     losses = [agent.losses(test_batch)[0].item() for agent in agents]
     assert result.test_losses == losses
     assert len(result.train_losses) == 12

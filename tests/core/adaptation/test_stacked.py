@@ -17,7 +17,7 @@ AGENTS = [
     ('gciql', {'actor_loss': 'awr'}),
     ('gciql', {'actor_loss': 'ddpgbc'}),
     ('saw', {}),
-    ('saw', {'const_std': False}),
+    ('saw', {'const_std': False, 'alpha': 0.5}),
 ]
 SIZES = [7, 16, 7, 3]  # of the test batches: two tasks share one
 

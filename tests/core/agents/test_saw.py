@@ -184,14 +184,14 @@ def test_step_moves_what_it_trains(actor_only):
 
 
 @given(
-    lengths=st.lists(st.integers(2, 30), min_size=1, max_size=5),
+    lengths=st.lists(st.integers(3, 30), min_size=1, max_size=5),
     steps=st.integers(1, 40),
     p_random=st.floats(0, 1),
     seed=st.integers(0, 2**32 - 1),
 )
 @hypothesis_settings(deadline=None, max_examples=60)
 def test_waypoints_lie_on_the_way_to_the_goal(lengths, steps, p_random, seed):
-    numbers = np.arange(sum(lengths))
+    numbers = np.arange(sum(lengths))[:, None]
     ends = np.cumsum(lengths)
     dataset = dataset_at(np.split(numbers, ends[:-1]))
     goals = {'actor': {'p_trajgoal': 1 - p_random, 'p_randomgoal': p_random}}
@@ -206,7 +206,7 @@ def test_waypoints_lie_on_the_way_to_the_goal(lengths, steps, p_random, seed):
 
 
 def test_waypoint_of_a_query_is_not_cut_at_another_goal():
-    dataset = dataset_at([range(40)])
+    dataset = dataset_at([np.arange(40)[:, None]])
     agent = make_agent('saw', obs_dim=1, act_dim=2, hidden=(2,), subgoal_steps=10)
     batches = QueryBatches(agent, dataset, np.arange(20), np.array([-7.0]), fix_actor_goal=0.5)
     batch = {

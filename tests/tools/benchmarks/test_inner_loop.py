@@ -14,7 +14,7 @@ def test_report_holds_every_learner_and_way(tmp_path, capsys):
     out = tmp_path / 'inner-loop.json'
     InnerLoopBenchmark(out=out, sizes=((8, 2, 16), (4, 1, 8)), steps=2, repeats=3).run()
     rows = json.loads(out.read_text())['results']['ms_per_step']
-    assert len(rows) == 4 * 2
+    assert len(rows) == 5 * 2
     for row in rows:
         assert row['eager / analytic'] == row['eager'] / row['analytic']
         assert min(row[way] for way in ('bfloat16', 'early stopping', 'products')) > 0

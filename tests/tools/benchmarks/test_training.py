@@ -67,7 +67,7 @@ def test_report_holds_every_agent_size_and_precision(tmp_path, capsys):
     ).run()
     report = json.loads(out.read_text())
     rows = report['results']['updates']
-    assert len(rows) == 2 * 4 * 2
+    assert len(rows) == 2 * 5 * 2
     assert {row['hidden'] for row in rows} == {'8 x 2', '4 x 2'}
     for row in rows:
         assert row['update / products'] == row['update'] / row['products']
