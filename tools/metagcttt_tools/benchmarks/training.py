@@ -168,8 +168,10 @@ def update_of(
 def random_batch(agent: Agent, size: int) -> TensorBatch:
     """A batch of normally distributed states and goals and uniform actions."""
     rng = np.random.default_rng(0)
-    states = ('observations', 'next_observations', 'value_goals', 'actor_goals')
-    states += ('subgoals', 'waypoints')  # which SAW takes
+    states = (
+        *('observations', 'next_observations', 'value_goals', 'actor_goals'),
+        *('subgoals', 'waypoints'),  # of SAW
+    )
     batch = {key: rng.normal(size=(size, agent.obs_dim)) for key in states}
     batch['actions'] = rng.uniform(-1, 1, size=(size, agent.act_dim))
     batch |= {'rewards': -np.ones(size), 'masks': np.ones(size)}
