@@ -104,7 +104,8 @@ def test_exported_agent_comes_back_under_either_names(name, const_std, rename, t
 @pytest.mark.parametrize('const_std', [True, False])
 @pytest.mark.parametrize('rename', [dict, as_names_of_saw])
 def test_exported_saw_comes_back_under_either_names(const_std, rename, tmp_path):
-    agent = tiny_agent('saw', obs_dim=3, act_dim=2, hidden=(6, 5, 4), const_std=const_std)
+    usual = dict.fromkeys(('alpha', 'subpolicy_alpha', 'waypoint_alpha'), 3.0)
+    agent = tiny_agent('saw', obs_dim=3, act_dim=2, hidden=(6, 5, 4), const_std=const_std, **usual)
     file = save(tmp_path / 'params.npz', rename(agent.export_reference_parameters()))
     convert_checkpoint.main([str(file), '--agent', 'saw', '--out', str(tmp_path / 'converted')])
     converted = load_checkpoint(tmp_path / 'converted')

@@ -184,7 +184,7 @@ def test_step_moves_what_it_trains(actor_only):
 
 
 @given(
-    lengths=st.lists(st.integers(3, 30), min_size=1, max_size=5),
+    lengths=st.lists(st.integers(2, 30), min_size=1, max_size=5),
     steps=st.integers(1, 40),
     p_random=st.floats(0, 1),
     seed=st.integers(0, 2**32 - 1),

@@ -7,7 +7,8 @@ import threading
 from metagcttt.goal_in_force import Goal
 from metagcttt.policy import deployment
 from metagcttt_core import adapt, FilterConfig, make_agent, save_checkpoint, TTTConfig
-from metagcttt_core.adaptation import AdaptationCancelled, inner_loop
+from metagcttt_core.adaptation import AdaptationCancelled
+from metagcttt_core.adaptation.engine import AnalyticEngine
 from metagcttt_core.agents.gciql import StateValue
 import numpy as np
 import pytest
@@ -206,19 +207,19 @@ def test_superseded_adaptation_takes_no_further_gradient_step(
     in_third_step, superseded = threading.Event(), threading.Event()
     steps: list[int] = []  # number of inner steps of each adaptation since the node is ready
 
-    def counted(agent, stepper, *args, **kwargs):
-        if not getattr(stepper, 'counted', False):
-            stepper.counted = True
+    def counted(engine, batch):
+        if not hasattr(engine, 'counted'):
+            engine.counted = True
             steps.append(0)
         steps[-1] += 1
         if steps == [3]:
             in_third_step.set()
             assert superseded.wait(30)
-        return gradient_step(agent, stepper, *args, **kwargs)
+        return step(engine, batch)
 
-    gradient_step = inner_loop.gradient_step
+    step = AnalyticEngine.step
     rig = make_rig(adapt_steps=1000, adaptation='hold')
-    monkeypatch.setattr(inner_loop, 'gradient_step', counted)
+    monkeypatch.setattr(AnalyticEngine, 'step', counted)
     rig.state()
     rig.goal(1)
     rig.graph.wait(in_third_step.is_set, 'the third step')
