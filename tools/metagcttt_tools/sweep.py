@@ -155,6 +155,18 @@ class Study:
         if along:
             budgets = {'budgets': settings.curve_budgets}
             self.curve = self._evaluation('curve', along, budgets)
+            self._check_curve_budgets()
+
+    def _check_curve_budgets(self) -> None:
+        """The curve ends with the policies that every adaptation evaluates."""
+        for name in self.settings.adaptations:
+            budgets = self.evaluations[name][0].budgets
+            missing = set(self.settings.curve_budgets) - set(budgets)
+            if missing:
+                raise ValueError(
+                    f'curve_budgets: {min(missing)} is not among the budgets of evaluate '
+                    f'({", ".join(map(str, budgets))})'
+                )
 
     def run(self) -> None:
         """Run whatever is not done yet."""
