@@ -3,18 +3,16 @@
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-import struct
 from typing import Any, NamedTuple
 
-from metagcttt_core.data import DatasetError
 from metagcttt_core.robot import Contract
 from metagcttt_core.robot.types import FieldType
-from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Nodetype
-from rosbags.rosbag2 import ReaderError
-from rosbags.serde import SerdeError
 from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
+
+from metagcttt_tools.common.bags import open_any_bag
 
 
 class Recorded(NamedTuple):
@@ -92,20 +90,8 @@ def open_bag(path: Path, contract: Contract, namespace: str = '') -> Iterator[Ba
     Raises:
         DatasetError: If the bag is missing or damaged, also while it is read.
     """
-    try:
-        humble = get_typestore(Stores.ROS2_HUMBLE)
-        with AnyReader([path], default_typestore=humble) as reader:
-            yield Bag(reader, contract, namespace)
-    except DatasetError as error:
-        raise DatasetError(f'{path}: {error}') from error
-    except FileNotFoundError as error:
-        raise DatasetError(f'{path}: no such bag ({error})') from error
-    # The packages below raise any of these for damaged files and messages.
-    except (
-        *(AnyReaderError, ReaderError, SerdeError, OSError, struct.error, RuntimeError),
-        *(AssertionError, LookupError, OverflowError, MemoryError, UnicodeDecodeError),
-    ) as error:
-        raise DatasetError(f'{path}: cannot be read as a bag ({error})') from error
+    with open_any_bag(path) as reader:
+        yield Bag(reader, contract, namespace)
 
 
 def _field_type(kind: Nodetype, content: Any) -> FieldType:
