@@ -54,8 +54,8 @@ def message_definition(type_name: str) -> str:
     if feedback := _FEEDBACK.fullmatch(type_name):
         package, action = feedback.groups()
         # What rosidl makes of the third part of an action's definition.
-        inner = f'{package}/msg/{action}_Feedback'
-        text = f'unique_identifier_msgs/UUID goal_id\n{package}/{action}_Feedback feedback\n'
+        inner = f'{package}/action/{action}_Feedback'
+        text = f'unique_identifier_msgs/UUID goal_id\n{inner} feedback\n'
         parts[inner] = _definition_file(package, 'action', action).split('\n---\n')[-1]
     else:
         text = _message_definition(type_name)
@@ -97,8 +97,11 @@ def _types_in(type_name: str, text: str) -> Iterator[str]:
         base = re.split(r'\[|<', words[0])[0]
         if base in _BUILTIN:
             continue
-        owner, _, name = base.rpartition('/')
-        yield f'{owner.removesuffix("/msg") or package}/msg/{name}'
+        if base.count('/') == 2:
+            yield base
+        else:
+            owner, _, name = base.rpartition('/')
+            yield f'{owner or package}/msg/{name}'
 
 
 class Recording:
