@@ -121,5 +121,4 @@ def copy_weights(source: Agent, target: Agent) -> None:
 
 
 def _copy(weights: Sequence[torch.Tensor], into: Sequence[torch.Tensor]) -> None:
-    for weight, copied in zip(weights, into, strict=True):
-        copied.copy_(weight)
+    torch._foreach_copy_(list(into), list(weights))

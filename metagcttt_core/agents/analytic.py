@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from metagcttt_core.agents.agent import Agent, TensorBatch
-from metagcttt_core.agents.passes import Passes
+from metagcttt_core.agents.passes import passes_of
+from metagcttt_core.kernels import Kernels
 
 HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
 
@@ -31,9 +32,9 @@ class AnalyticLoss(ABC):
 class Cloning(AnalyticLoss):
     """Negative log-likelihood of the actions with unit standard deviation, of GCBC."""
 
-    def __init__(self, agent: Agent, dtype: torch.dtype) -> None:
+    def __init__(self, agent: Agent, dtype: torch.dtype, kernels: Kernels | None = None) -> None:
         """The loss of `agent`, with matrix products in `dtype`."""
-        self.actor = Passes(agent.actor, dtype=dtype)
+        self.actor = passes_of(agent.actor, dtype, kernels)
         self.gradients = self.actor.gradients
 
     @torch.no_grad()
@@ -42,7 +43,8 @@ class Cloning(AnalyticLoss):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """See `AnalyticLoss`."""
         error, _ = self.error(batch)
-        loss, mse = cloning_loss(error), error.square().mean()
+        mse = error.square().mean()
+        loss = mse * (0.5 * error.shape[1]) + error.shape[1] * HALF_LOG_TWO_PI
         if backward:
             self.actor.backward(error.div_(len(error)))
         return loss, {'bc': loss, 'mse': mse}

@@ -6,20 +6,32 @@ from torch import Tensor
 from metagcttt_core.agents.agent import TensorBatch
 from metagcttt_core.agents.analytic import AnalyticLoss, Cloning, cloning_loss, HALF_LOG_TWO_PI
 from metagcttt_core.agents.gciql import GCIQL
-from metagcttt_core.agents.passes import Passes
+from metagcttt_core.agents.passes import passes_of
+from metagcttt_core.kernels import Kernels
 
 
 class AnalyticGCIQL(AnalyticLoss):
     """`GCIQL.losses` of an agent whose actor has unit standard deviation."""
 
-    def __init__(self, agent: GCIQL, dtype: torch.dtype, *, actor_only: bool) -> None:
+    def __init__(
+        self,
+        agent: GCIQL,
+        dtype: torch.dtype,
+        kernels: Kernels | None = None,
+        *,
+        actor_only: bool,
+    ) -> None:
         """The loss of `agent`, with matrix products in `dtype`."""
         self._settings = agent.settings
         self._actor_only = actor_only
-        self._cloning = Cloning(agent, dtype)
-        self._value = Passes(agent.value, dtype=dtype)
-        self._critics = [Passes(net, dtype=dtype) for net in (agent.critic1, agent.critic2)]
-        self._targets = [Passes(net, dtype=dtype) for net in (agent.target1, agent.target2)]
+        self._cloning = Cloning(agent, dtype, kernels)
+        self._value, *critics = (
+            passes_of(network, dtype, kernels)
+            for network in (
+                *(agent.value, agent.critic1, agent.critic2, agent.target1, agent.target2),
+            )
+        )
+        self._critics, self._targets = critics[:2], critics[2:]
         networks = [self._cloning.actor]
         if not actor_only:
             networks += [self._value, *self._critics]
