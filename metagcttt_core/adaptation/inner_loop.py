@@ -78,6 +78,7 @@ def run_inner_loop(
         train_losses=torch.stack(train_losses).tolist() if train_losses else [],
         test_losses=[] if best is None else best.losses,
         best_step=len(train_losses) if best is None else best.step,
+        engine=steps.name,
     )
 
 
