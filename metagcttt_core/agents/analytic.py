@@ -34,27 +34,18 @@ class Cloning(AnalyticLoss):
 
     def __init__(self, agent: Agent, dtype: torch.dtype, kernels: Kernels | None = None) -> None:
         """The loss of `agent`, with matrix products in `dtype`."""
-        self.actor = passes_of(agent.actor, dtype, kernels)
-        self.gradients = self.actor.gradients
+        self._actor = passes_of(agent.actor, dtype, kernels)
+        self.gradients = self._actor.gradients
 
     @torch.no_grad()
     def __call__(
         self, batch: TensorBatch, *, backward: bool = True
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """See `AnalyticLoss`."""
-        error, _ = self.error(batch)
+        states = torch.cat([batch['observations'], batch['actor_goals']], dim=-1)
+        error = self._actor.forward(states).sub_(batch['actions'])
         mse = error.square().mean()
         loss = mse * (0.5 * error.shape[1]) + error.shape[1] * HALF_LOG_TWO_PI
         if backward:
-            self.actor.backward(error.div_(len(error)))
+            self._actor.backward(error.div_(len(error)))
         return loss, {'bc': loss, 'mse': mse}
-
-    def error(self, batch: TensorBatch) -> tuple[Tensor, Tensor]:
-        """The policy's means minus the actions, and the means, each (B, act_dim)."""
-        mean = self.actor.forward(torch.cat([batch['observations'], batch['actor_goals']], dim=-1))
-        return mean - batch['actions'], mean
-
-
-def cloning_loss(error: Tensor) -> Tensor:
-    """The mean of -log pi over a batch whose means err by `error` (B, act_dim)."""
-    return error.square().sum(-1).mul_(0.5).mean() + error.shape[1] * HALF_LOG_TWO_PI

@@ -2,6 +2,7 @@
  * are left to the BLAS library that PyTorch brings along. All arrays are row-major float32. */
 #include <math.h>
 #include <stdint.h>
+#include <stdlib.h>
 #include <string.h>
 
 typedef void sgemm_t(const char *, const char *, const int *, const int *, const int *,
@@ -157,6 +158,23 @@ static void multiply(sgemm_t *sgemm, char left_as, char right_as, int64_t m, int
           &left_stride, &zero, into, &columns);
 }
 
+/* The gradient of a layer's weight. BLAS is slow where its result is only a few columns wide. */
+static void weight_gradient(sgemm_t *sgemm, const struct layer *layer, int64_t rows,
+                            const float *gradient, const float *seen)
+{
+    const int64_t n = layer->inputs, m = layer->outputs;
+    float *turned = n < 16 ? malloc(m * n * sizeof(float)) : NULL;
+    if (!turned) {
+        multiply(sgemm, 'T', 'N', m, n, rows, gradient, seen, layer->weight_slope);
+        return;
+    }
+    multiply(sgemm, 'T', 'N', n, m, rows, seen, gradient, turned);
+    for (int64_t i = 0; i < m; i++)
+        for (int64_t j = 0; j < n; j++)
+            layer->weight_slope[i * n + j] = turned[j * m + i];
+    free(turned);
+}
+
 /* Map inputs (rows, in) to outputs (rows, out) through `count` layers, the last a head. */
 void forward(sgemm_t *sgemm, const struct layer *layers, int64_t count, int64_t rows,
              const float *inputs, float *outputs)
@@ -194,8 +212,7 @@ void backward(sgemm_t *sgemm, const struct layer *layers, int64_t count, int64_t
         const struct layer *layer = layers + i;
         const float *seen = i ? layers[i - 1].output : inputs;
         if (weights)
-            multiply(sgemm, 'T', 'N', layer->outputs, layer->inputs, rows, gradient, seen,
-                     layer->weight_slope);
+            weight_gradient(sgemm, layer, rows, gradient, seen);
         float *below = i ? layers[i - 1].output : into;
         if (!below)
             break;
