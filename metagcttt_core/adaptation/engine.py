@@ -174,7 +174,9 @@ def _kernels_for(name: EngineName) -> Kernels | None:
     if name not in ('auto', 'kernels'):
         return None
     try:
-        return load_kernels()
+        kernels = load_kernels()
+        _ = kernels.sgemm
+        return kernels
     except KernelsUnavailable as error:
         if name == 'kernels':
             raise ValueError(f'engine kernels: {error}; use auto') from error

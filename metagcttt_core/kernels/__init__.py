@@ -1,4 +1,4 @@
-"""Kernels in C for the passes of a network, compiled for the processor that they run on.
+"""Kernels in C for what is done for every goal, compiled for the processor that they run on.
 
 That takes half a second, once: the library is kept in `$XDG_CACHE_HOME/metagcttt`, by the hash of
 its source, compiler and processor. A machine without a C compiler does without.
@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 import ctypes
 from ctypes import c_double, c_int, c_int64, c_void_p
-from functools import cache
+from functools import cache, cached_property
 import hashlib
 import os
 from pathlib import Path
@@ -20,12 +20,12 @@ from typing import Any
 
 from metagcttt_core.files import atomic_write
 
-_SOURCE = Path(__file__).with_name('passes.c')
+_SOURCES = tuple(Path(__file__).with_name(name) for name in ('nearest.c', 'passes.c'))
 _COMPILERS = ('cc', 'gcc', 'clang')
 # `fopenmp-simd` vectorises sums and needs no library. Not `ffast-math`: a library linked with it
 # changes how the whole process treats the smallest numbers.
 _FLAGS = (
-    *('-O3', '-march=native', '-ffp-contract=fast', '-fno-math-errno', '-fno-trapping-math'),
+    *('-O3', '-march=native', '-ffp-contract=off', '-fno-math-errno', '-fno-trapping-math'),
     *('-fopenmp-simd', '-fPIC', '-shared'),
 )
 _COMPILE_TIMEOUT_S = 120
@@ -47,15 +47,10 @@ class Layer(ctypes.Structure):
 
 
 class Kernels:
-    """The functions of passes.c; arrays are passed by their addresses.
-
-    Attributes:
-        sgemm: Address of the BLAS routine for the products.
-    """
+    """The functions in C; arrays are passed by their addresses."""
 
     def __init__(self, library: ctypes.CDLL) -> None:
         """Bind the functions of a compiled `library`."""
-        self.sgemm = _sgemm()
 
         def bind(name: str, *types: Any) -> Callable[..., None]:
             function = library[name]
@@ -68,19 +63,47 @@ class Kernels:
         )
         self.activate = bind('activate', c_void_p, c_int64)
         self.activate_backward = bind('activate_backward', c_void_p, c_int64, c_void_p, c_int)
+        self.nearest_per_episode = bind(
+            'nearest_per_episode',
+            *[c_int64, c_void_p, c_void_p, c_void_p, c_int64, c_void_p, c_void_p, c_double],
+            *[c_void_p] * 5,
+        )
         self.adam = bind('adam', c_int64, *[c_void_p] * 5, *[c_double] * 5)
+
+    @cached_property
+    def sgemm(self) -> int:
+        """The address of the BLAS routine that PyTorch brings along.
+
+        Raises:
+            KernelsUnavailable: If it brings none.
+        """
+        import torch
+
+        path = Path(torch.__file__).parent / 'lib' / 'libtorch_cpu.so'
+        try:
+            address = ctypes.cast(ctypes.CDLL(str(path)).sgemm_, c_void_p).value
+        except (OSError, AttributeError) as error:
+            raise KernelsUnavailable(f'no BLAS routine in PyTorch ({error})') from error
+        assert address is not None
+        return address
 
 
 def load_kernels() -> Kernels:
     """The kernels, compiled if this processor has none yet; looked for once in a process.
 
     Raises:
-        KernelsUnavailable: Without a compiler, or where it or PyTorch's BLAS library do not serve.
+        KernelsUnavailable: Without a compiler, or where it does not serve.
     """
     found = _find()
     if isinstance(found, KernelsUnavailable):
         raise found
     return found
+
+
+def kernels_if_any() -> Kernels | None:
+    """The kernels, or None without a compiler."""
+    found = _find()
+    return found if isinstance(found, Kernels) else None
 
 
 @cache
@@ -91,18 +114,19 @@ def _find() -> Kernels | KernelsUnavailable:
     command = [*compiler.split(), *_FLAGS]
     try:
         folder = _cache_folder()
-        key = _digest(_SOURCE.read_bytes(), ' '.join(command).encode(), _processor())
+        sources = [source.read_bytes() for source in _SOURCES]
+        key = _digest(*sources, ' '.join(command).encode(), _processor())
         for library in _kept(folder, key):
             return Kernels(library)
         content = _compiled(command)
-        return Kernels(_loaded(content, folder / f'passes-{key}-{_digest(content)}.so'))
+        return Kernels(_loaded(content, folder / f'kernels-{key}-{_digest(content)}.so'))
     except (OSError, AttributeError, RuntimeError, subprocess.SubprocessError) as error:
         return KernelsUnavailable(f'{command[0]}: {_reason(error)}')
 
 
 def _kept(folder: Path, key: str) -> Iterator[ctypes.CDLL]:
     """Libraries compiled before whose content is what their name says."""
-    for path in folder.glob(f'passes-{key}-*.so'):
+    for path in folder.glob(f'kernels-{key}-*.so'):
         with suppress(OSError):
             if path.stem.endswith(_digest(path.read_bytes())):
                 yield ctypes.CDLL(str(path))
@@ -110,9 +134,9 @@ def _kept(folder: Path, key: str) -> Iterator[ctypes.CDLL]:
 
 def _compiled(command: list[str]) -> bytes:
     with tempfile.TemporaryDirectory(prefix='metagcttt-') as folder:
-        path = Path(folder, 'passes.so')
+        path = Path(folder, 'kernels.so')
         subprocess.run(
-            [*command, str(_SOURCE), '-o', str(path), '-lm'],
+            [*command, *map(str, _SOURCES), '-o', str(path), '-lm'],
             check=True,
             capture_output=True,
             text=True,
@@ -132,17 +156,6 @@ def _loaded(content: bytes, path: Path) -> ctypes.CDLL:
             temporary.write(content)
             temporary.flush()
             return ctypes.CDLL(temporary.name)
-
-
-def _sgemm() -> int:
-    """The address of the BLAS routine that PyTorch brings along."""
-    import torch
-
-    folder = Path(torch.__file__).parent / 'lib'
-    library = ctypes.CDLL(str(folder / 'libtorch_cpu.so'))
-    address = ctypes.cast(library.sgemm_, c_void_p).value
-    assert address is not None
-    return address
 
 
 def _cache_folder() -> Path:
