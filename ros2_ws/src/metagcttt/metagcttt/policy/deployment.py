@@ -91,7 +91,7 @@ def warm_up(deployment: Deployment) -> None:
     At the first step PyTorch imports and initialises for a second or two, which would stall the
     control loop.
     """
-    observation = np.asarray(deployment.dataset.observations[0], dtype=np.float64)
+    observation = np.asarray(deployment.dataset.states(0), dtype=np.float64)
     agent, trajectory_filter = deployment.agent, deployment.trajectory_filter
     support = trajectory_filter.query(observation, observation, agent.value_fn)
     config = TTTConfig(steps=1, batch_size=2)
