@@ -77,14 +77,13 @@ class TrajectoryFilter:
         began = time.perf_counter()
         state = self._checked('state', state)
         goal = self._checked('goal', goal)
+        place, target = state - self.dataset.origin, goal - self.dataset.origin
         dims, epsilon = list(self.config.position_dims), self.config.epsilon
         task = Task(
             dataset=self.dataset,
-            near_state=Ball(self._index, state[dims], epsilon),
-            near_goal=Ball(self._index, goal[dims], epsilon),
-            value=None
-            if value_fn is None
-            else partial(self._value_cache.values, value_fn, goal.astype(np.float32)),
+            near_state=Ball(self._index, place[dims], epsilon),
+            near_goal=Ball(self._index, target[dims], epsilon),
+            value=None if value_fn is None else partial(self._value_cache.values, value_fn, goal),
         )
         found = VARIANTS[self.config.variant](task, self.config)
         starts = found.starts[found.keep]
@@ -137,7 +136,8 @@ class TrajectoryFilter:
             raise ValueError(
                 f'position must be {len(self.config.position_dims)} finite numbers, got {position}'
             )
-        return self._index.nearest(position)
+        dims = list(self.config.position_dims)
+        return self._index.nearest(position - self.dataset.origin[dims])
 
     def _checked(self, name: str, values: np.ndarray) -> np.ndarray:
         array = np.asarray(values, dtype=np.float64)

@@ -256,7 +256,14 @@ POLICY_NODE = (
 
 RECORDER_NODE = (
     Parameter(
-        'output', '', 'file to write (.mcap), which must not exist; empty: ./rec-DATE-TIME.mcap'
+        'output',
+        '',
+        'file (.mcap) or bag folder to write, which must not exist; empty: ./rec-DATE-TIME.mcap',
+    ),
+    Parameter(
+        'hidden_topics',
+        False,
+        'record hidden topics too, such as the feedback and the status of actions',
     ),
     Parameter('split_mb', 0.0, 'start a new file at this size, megabytes; 0: never', (0, 1000000)),
     Parameter(

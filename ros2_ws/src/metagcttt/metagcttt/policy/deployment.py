@@ -108,7 +108,7 @@ def warm_up(deployment: Deployment, config: TTTConfig) -> str:
         ValueError: If policy or machine do not have the engine that is asked for.
     """
     agent, dataset = deployment.agent, deployment.dataset
-    observation = np.asarray(dataset.observations[0], dtype=np.float64)
+    observation = np.asarray(dataset.states(0), dtype=np.float64)
     deployment.trajectory_filter.query(observation, observation, agent.value_fn)
     batch = agent.relabeller(dataset).sample(config.batch_size, np.random.default_rng(0))
     step = run_inner_loop(
