@@ -15,6 +15,6 @@ def load_contract(path: str | Path) -> Contract:
             mistake, with file, line, setting, what was got and what is accepted.
     """
     try:
-        return load_yaml(path, Contract, 'a contract')
+        return load_yaml(path, Contract)
     except SettingsFileError as error:
         raise ContractError(str(error)) from error

@@ -118,7 +118,7 @@ def load_columns(path: Path) -> ColumnMap:
     Raises:
         SettingsFileError: With a line for each mistake: file, line, setting and what is accepted.
     """
-    return load_yaml(path, ColumnMap, 'a column map')
+    return load_yaml(path, ColumnMap)
 
 
 def map_of_contract(
