@@ -88,7 +88,7 @@ def inspect(dataset: TrajectoryDataset) -> Inspection:
     if not len(steps):
         raise DatasetError(f'{dataset.source or "dataset"}: no transitions')
     following = steps + 1
-    observations = np.asarray(dataset.observations)
+    observations = np.asarray(dataset.states(slice(None)))
     # The last action of a trajectory is stored, but never taken.
     within = steps[~dataset.terminals[following]]
     return Inspection(

@@ -76,10 +76,11 @@ def hold_out(
     rows = held[dataset.episode_of(np.arange(dataset.num_rows))]
     kept, out = (
         TrajectoryDataset.from_arrays(
-            dataset.observations[part],
+            dataset.states(part),
             dataset.actions[part],
             dataset.terminals[part],
             source=dataset.source,
+            contract=dataset.contract,
         )
         for part in (~rows, rows)
     )
@@ -140,7 +141,7 @@ def evaluate_query(
         seed: Of the adaptation.
     """
     rows = np.arange(query.row, query.row + query.steps)
-    state, goal = held_out.observations[query.row], held_out.observations[rows[-1] + 1]
+    state, goal = held_out.states(query.row), held_out.states(int(rows[-1]) + 1)
     support = trajectory_filter.query(state, goal, agent.value_fn)
     dims = list(trajectory_filter.config.position_dims)
     errors, log_likelihoods = {}, {}
@@ -163,14 +164,19 @@ def _compare(
     agent: Agent, held_out: TrajectoryDataset, rows: NDArray[np.int64], goal: np.ndarray
 ) -> tuple[float, float]:
     """Mean squared error per value of an action, and mean log-density of the recorded actions."""
-    observations = np.asarray(held_out.observations[rows])
-    actions = np.asarray(held_out.actions[rows])
+    observations, actions = held_out.states(rows), np.asarray(held_out.actions[rows])
     error = float(np.square(agent.act(observations, goal) - actions).mean())
-    goals = np.broadcast_to(goal, observations.shape)
-    batch = agent.tensors({'observations': observations, 'goals': goals, 'actions': actions})
+    scaling = agent.scaling
+    batch = agent.tensors(
+        {
+            'observations': scaling.observations(observations),
+            'goals': scaling.observations(np.broadcast_to(goal, observations.shape)),
+            'actions': scaling.actions(actions),
+        }
+    )
     with torch.inference_mode():
         log_prob, _ = agent.log_prob(batch['observations'], batch['goals'], batch['actions'])
-    return error, float(log_prob.mean())
+    return error, float(log_prob.mean()) - float(np.log(scaling.limit).sum())
 
 
 def bootstrap(

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from concurrent.futures import as_completed, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from functools import lru_cache
-import json
 import multiprocessing
 from pathlib import Path
 import sys
@@ -24,10 +24,11 @@ from metagcttt_core.evaluation.offline import (
     Outcome,
     Query,
 )
-from metagcttt_core.files import write_json
+from metagcttt_core.files import read_json, write_json
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
+from sim_bridge.generation.workers import end_with_parent
 from tqdm import tqdm
 
 from metagcttt_tools.common.cli import fail, parse
@@ -219,6 +220,8 @@ def _each(
         futures = {pool.submit(_outcomes, *job): job for job in jobs}
         for future in as_completed(futures):
             yield futures[future], future.result()
+    except BrokenProcessPool as error:
+        raise ValueError('a worker process died (out of memory?): give fewer processes') from error
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -239,6 +242,8 @@ def _start_worker(
     queries: list[Query],
 ) -> None:
     use_threads(1)
+    if multiprocessing.parent_process() is not None:
+        end_with_parent()
     _Worker.settings, _Worker.train = settings, train
     _Worker.held_out, _Worker.queries = held_out, queries
     _filter.cache_clear()
@@ -372,7 +377,7 @@ def read_success(path: Path) -> dict[Key, float]:
         ValueError: If the file has no such results.
     """
     try:
-        report = json.loads(path.read_text('utf-8'))
+        report = read_json(path)
         settings = report['settings']
         epsilon, lr = settings['filter']['epsilon'], settings['ttt']['lr']
         return {
@@ -389,8 +394,8 @@ def correlation(
 ) -> dict[str, Any]:
     """Spearman's rank correlation of success in simulation with less error on held-out data.
 
-    Over all policies and settings that both have, its 95 percent interval from resampling them,
-    and within each policy, over its settings.
+    Over all policies and settings that both have, with its 95 percent interval from resampling
+    them; within each policy, over its settings; and the mean of those, resampled by policy.
 
     Raises:
         ValueError: If there are less than three.
@@ -411,10 +416,15 @@ def correlation(
     for key, pair in pairs.items():
         within[key[0]].append(pair)
     low, high = np.nanpercentile(resampled, (2.5, 97.5))
+    each = {name: spearman(np.array(rows)) for name, rows in within.items()}
+    known = np.array([value for value in each.values() if np.isfinite(value)])
     return {
         'spearman': {'mean': spearman(values), 'low': float(low), 'high': float(high)},
         'arms': len(values),
-        'within': {name: spearman(np.array(rows)) for name, rows in within.items()},
+        'within': each,
+        'within_mean': interval(bootstrap(known, np.arange(len(known))))._asdict()
+        if len(known)
+        else None,
         'pairs': [
             {
                 **dict(zip(('checkpoint', 'budget', 'epsilon', 'lr'), key, strict=True)),
@@ -444,4 +454,8 @@ def describe_correlation(found: dict[str, Any]) -> str:
         f'{total["mean"]:.2f} ({total["low"]:.2f} to {total["high"]:.2f})'
     ]
     lines += [f'  within {name}: {value:.2f}' for name, value in found['within'].items()]
+    if mean := found['within_mean']:
+        lines.append(
+            f'  within a policy: {mean["mean"]:.2f} ({mean["low"]:.2f} to {mean["high"]:.2f})'
+        )
     return '\n'.join(lines)

@@ -77,7 +77,7 @@ def main(argv: list[str] | None = None) -> None:
         fail(f'coverage must be two of the observed values 0 to {width - 1}')
     print(*opened.remarks, opened.dataset, sep='\n')
     print(describe(found, opened.observed, opened.commanded))
-    places = opened.dataset.observations[:, [x, y]]
+    places = opened.dataset.states(slice(None))[:, [x, y]]
     plots.save(plots.places_picture(places, opened.observed[x], opened.observed[y]), settings.out)
     print(f'coverage: {settings.out}')
 

@@ -35,7 +35,7 @@ def offline_picture(results: list[dict[str, Any]]) -> Figure:
     if 1 < len(arms) <= 12:
         left.legend(frameon=False, fontsize=6)
     for axes in (left, right):
-        axes.set(xlabel='steps of test-time training K', ylabel='action error (rms, -1 to 1)')
+        axes.set(xlabel='steps of test-time training K', ylabel='action error (rms)')
         axes.grid(alpha=0.25)
     return figure
 
