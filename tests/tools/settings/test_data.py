@@ -218,6 +218,7 @@ INSPECT = Walk(
     {
         'data': '@half.npz',
         'contract': Proof('@cart.yaml', refused='the contract of cart has 4 and 2'),
+        'columns': Proof('@action.yaml', {'data': PUSHT}),
         'coverage': [1, 0],
         'out': 'elsewhere.png',
     },
