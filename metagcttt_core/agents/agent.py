@@ -19,6 +19,7 @@ from metagcttt_core.data.scaling import Scaling
 
 if TYPE_CHECKING:
     from metagcttt_core.agents.analytic import AnalyticLoss
+    from metagcttt_core.kernels import Kernels
 
 TensorBatch = dict[str, Tensor]
 OptimizerState = dict[int, dict[str, Tensor]]
@@ -99,13 +100,18 @@ class Agent(nn.Module, ABC):
         """Move the networks that trail others; called with each full update, before its step."""
 
     def analytic_loss(
-        self, *, actor_only: bool = False, dtype: torch.dtype = torch.float32
+        self,
+        *,
+        actor_only: bool = False,
+        dtype: torch.dtype = torch.float32,
+        kernels: 'Kernels | None' = None,
     ) -> 'AnalyticLoss | None':
         """The same loss with its gradient written out, or None where `losses` is all there is.
 
         Args:
             actor_only: Leave out the terms that do not train the actor.
             dtype: Of the operands of matrix products.
+            kernels: Compute by these, from `load_kernels`; in tensor operations by default.
         """
         return None
 

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 import hashlib
-import json
 from pathlib import Path
 import re
 from typing import Any
@@ -18,7 +17,7 @@ from metagcttt_core.agents import AGENTS
 from metagcttt_core.agents.agent import Agent, OptimizerState
 from metagcttt_core.config.settings import error_lines, Settings
 from metagcttt_core.data.scaling import Scaling
-from metagcttt_core.files import atomic_write, write_json
+from metagcttt_core.files import atomic_write, read_json, write_json
 
 FORMAT_VERSION = 1
 _INDEX = 'checkpoint.json'
@@ -248,12 +247,12 @@ def _folder(path: str | Path) -> Path:
 def _read_index(folder: Path) -> _Index:
     file = folder / _INDEX
     try:
-        values = json.loads(file.read_text(encoding='utf-8'))
+        values = read_json(file)
     except (FileNotFoundError, NotADirectoryError) as error:
         raise CheckpointError(f'{folder}: no checkpoint there ({_INDEX} is missing)') from error
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise CheckpointError(f'{file}: not valid JSON ({error})') from error
-    if not isinstance(values, dict) or values.get('format') != 'metagcttt-checkpoint':
+    except (OSError, ValueError) as error:
+        raise CheckpointError(str(error)) from error
+    if values.get('format') != 'metagcttt-checkpoint':
         raise CheckpointError(f'{file}: not a checkpoint of this project (format is missing)')
     if values.get('version') != FORMAT_VERSION:
         raise CheckpointError(
