@@ -41,9 +41,11 @@ class Robot:
             ends, np.zeros((2, contract.act_dim)), [False, True], contract=contract.identity
         ).save(data)
         self.is_cart = text == CART
-        self.place = [0.0, 0.0]
+        self.place, self.senses = [0.0, 0.0], True
         graph.add(RobotBridgeNode, contract=str(file))
-        self.goals = graph.add(GoalNode, contract=str(file), dataset=str(data))
+        self.goals = graph.add(
+            GoalNode, contract=str(file), dataset=str(data), state_timeout_s=1.0
+        )
         self.events = graph.collect(EpisodeEvent, 'episode', EVERY)
         states = graph.collect(MazeState, 'state', ANY)
         kind, topic = (Odometry, 'odom') if self.is_cart else (JointState, 'joint_states')
@@ -55,6 +57,8 @@ class Robot:
         graph.wait(lambda: states, 'states')
 
     def sense(self) -> None:
+        if not self.senses:
+            return
         if self.is_cart:
             message = odometry(self.graph.node.get_clock().now().nanoseconds, self.place[0])
             message.pose.pose.position.y = 5e6 + self.place[1]
@@ -153,3 +157,20 @@ def test_states_of_another_contract_end_no_goal(graph: Graph, tmp_path: Path) ->
     graph.publish('policy_status', PolicyStatus(), EVERY)
     robot.place = [1.0, 0.0]
     assert robot.ends(sent) == (0, '')
+
+
+def test_robot_that_falls_silent_loses_its_goal_and_takes_the_next(
+    graph: Graph, tmp_path: Path
+) -> None:
+    robot = Robot(graph, tmp_path, CART)
+    graph.publish('map', room(), EVERY)
+    graph.wait(lambda: robot.goals._tracker._catalog.obstacles, 'the map')
+    sent = robot.client.send({'x': 1.0})
+    robot.senses = False
+    code, why = robot.ends(sent)
+    assert (code, 'no state of episode 1' in why) == (RESULT.STATE_LOST, True)
+    # Back on another clock: refused until it is the bridge's again.
+    ahead = odometry(graph.node.get_clock().now().nanoseconds + 10**11, 1.0)
+    robot._sensor.publish(ahead)
+    robot.place, robot.senses = [1.0, 0.0], True
+    assert robot.ends(robot.client.send({'x': 1.0})) == (0, '')
