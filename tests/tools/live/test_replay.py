@@ -67,6 +67,10 @@ def test_time_goes_forwards_and_backwards(recording: Path) -> None:
     assert replay.time_s == replay.duration_s
 
 
+def test_folder_of_a_bag_is_read(recording: Path) -> None:
+    assert Replay(recording.parent, '/robot1', '', '').duration_s == pytest.approx(10.0)
+
+
 def test_health_is_that_of_the_time(recording: Path) -> None:
     replay = Replay(recording, '/robot1', '', '')
     for at_s, health in (

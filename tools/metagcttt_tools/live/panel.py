@@ -142,7 +142,7 @@ class Player:
             duration_s: Length of the recording.
             seek: Called with the time that was chosen by hand.
         """
-        self._time = gui.add_slider('Time (s)', 0.0, max(duration_s, 0.1), 0.1, 0.0)
+        self._time = gui.add_slider('Time (s)', 0.0, max(round(duration_s, 1), 0.1), 0.1, 0.0)
         self._play = gui.add_checkbox('Play', True)
         self._speed = gui.add_dropdown(
             'Speed', ('0.25', '0.5', '1', '2', '5', '10'), initial_value='1'

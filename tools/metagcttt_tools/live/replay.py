@@ -11,8 +11,8 @@ from metagcttt_interfaces.msg import PolicyStatus
 
 from metagcttt_tools.live.robots import recorded, Robot
 from metagcttt_tools.live.words import health_of, news_of, WAITING
+from metagcttt_tools.recordings.bags import read_bag
 from metagcttt_tools.recordings.goal_views import maze_of
-from metagcttt_tools.recordings.mcap import read_messages
 
 _TYPES = {
     'map': 'nav_msgs/msg/OccupancyGrid',
@@ -51,7 +51,7 @@ class Replay:
         """
         self._robot_name = robot.rstrip('/')
         self._found: dict[str, tuple[list[float], list[Any]]] = defaultdict(lambda: ([], []))
-        content = read_messages(recording, _TYPES.values())
+        content = read_bag(recording, _TYPES.values())
         now_s, before = 0.0, None
         for each in content.messages:
             if before is not None and before.stretch == each.stretch:
@@ -66,8 +66,8 @@ class Replay:
             raise DatasetError(f'{recording}: no state on {self._name("state")}; topics: {topics}')
         maps = self._found[self._name('map')][1]
         self.grid = maps[-1] if maps else None
-        first = self._found[self._name('state')][1][0]
-        known = recorded(maze_of(self.grid), len(first.observation)) if self.grid else None
+        last = self._found[self._name('state')][1][-1]
+        known = recorded(maze_of(self.grid), len(last.observation)) if self.grid else None
         self.robot: Robot | None = known or Robot()
         self.policy = {each.name: each.default for each in POLICY_NODE}
         self.policy.update(checkpoint=checkpoint, dataset=dataset)

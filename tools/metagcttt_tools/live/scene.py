@@ -56,7 +56,12 @@ class MazeScene:
             if boxes := list(_wall_boxes(maze, self._unit / 3)):
                 walls = one_mesh(boxes)
                 self._scene.add_mesh_simple(
-                    '/walls', walls.vertices, walls.faces, color=WALL, flat_shading=True
+                    '/walls',
+                    walls.vertices,
+                    walls.faces,
+                    color=WALL,
+                    flat_shading=True,
+                    receive_shadow=False,
                 )
             self._robot = self._scene.add_icosphere(
                 '/robot', radius=0.18 * self._unit, color=ROBOT, visible=False
