@@ -16,6 +16,7 @@ from torch import Tensor
 from metagcttt_core.agents import AGENTS
 from metagcttt_core.agents.agent import Agent, OptimizerState
 from metagcttt_core.config.settings import error_lines, Settings
+from metagcttt_core.data.scaling import Scaling
 from metagcttt_core.files import atomic_write, read_json, write_json
 
 FORMAT_VERSION = 1
@@ -58,6 +59,7 @@ class _Index(Settings):
     act_dim: int = Field(ge=1)
     settings: dict[str, Any]
     metadata: dict[str, Any]
+    scaling: dict[str, Any] | None = None
     weights: str = Field(pattern=r'^weights-[0-9a-f]{16}\.safetensors$')
     training: _Training | None = None
 
@@ -100,13 +102,16 @@ def save_checkpoint(agent: Agent, path: str | Path, training: TrainingState | No
         act_dim=agent.act_dim,
         settings=agent.settings.model_dump(mode='json'),
         metadata=agent.metadata,
+        scaling=None if agent.scaling.is_identity else agent.scaling.to_json(),
         weights=weights,
         training=training
         and _Training(stage=training.stage, step=training.step, settings=training.settings),
     )
     with atomic_write(folder / weights) as file:
         file.write(content)
-    write_json(folder / _INDEX, index.model_dump(mode='json'))
+    # Without a scaling, programs of before there was one can read it.
+    unused = set() if index.scaling else {'scaling'}
+    write_json(folder / _INDEX, index.model_dump(mode='json', exclude=unused))
     for old in folder.glob('weights-*.safetensors'):
         if old.name != weights:
             old.unlink()
@@ -167,6 +172,11 @@ def load_checkpoint(
         if not torch.isfinite(saved[name]).all():
             raise CheckpointError(f'{folder}: weight {name} holds a non-finite value')
     agent = agent_type(index.obs_dim, index.act_dim, settings, torch.Generator())
+    if index.scaling is not None:
+        try:
+            agent.scaling = Scaling.from_json(index.scaling, index.obs_dim, index.act_dim)
+        except (ValueError, TypeError) as error:
+            raise CheckpointError(f'{folder}: {error}') from error
     agent.load_state_dict(saved)
     agent.metadata = dict(index.metadata)
     own_run = index.training is not None and index.training.stage == _PRETRAINING

@@ -1,17 +1,18 @@
 """Bags as recorded by ROS: folders, .mcap, .db3, split or compressed. No ROS."""
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, ExitStack
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from metagcttt_core.data import DatasetError
 from metagcttt_core.robot import Contract
 from metagcttt_core.robot.types import FieldType
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
+
+from metagcttt_tools.common.bags import open_any_bag, reading
 
 
 class Recorded(NamedTuple):
@@ -64,7 +65,7 @@ class Bag:
         connections = [connection for _, connection in self._connections.values()]
         if not connections:
             return
-        with _reading(self._path):
+        with reading(self._path):
             for connection, received_ns, data in self._reader.messages(connections):
                 message = self._reader.deserialize(data, connection.msgtype)
                 yield Recorded(self._names[connection.topic], message, received_ns)
@@ -91,27 +92,10 @@ def open_bag(path: Path, contract: Contract, namespace: str = '') -> Iterator[Ba
     Raises:
         DatasetError: If the bag is missing or damaged, also while it is read.
     """
-    humble = get_typestore(Stores.ROS2_HUMBLE)
-    with ExitStack() as stack:
-        with _reading(path):
-            reader = stack.enter_context(AnyReader([path], default_typestore=humble))
+    with open_any_bag(path) as reader:
+        with reading(path):
             bag = Bag(path, reader, contract, namespace)
-        try:
-            yield bag
-        except DatasetError as error:
-            named = str(error).startswith(str(path))
-            raise error if named else DatasetError(f'{path}: {error}') from error
-
-
-@contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    """Where packages read the bag, which raise errors of any kind for damaged files."""
-    try:
-        yield
-    except FileNotFoundError as error:
-        raise DatasetError(f'{path}: no such bag ({error})') from error
-    except Exception as error:
-        raise DatasetError(f'{path}: cannot be read as a bag ({error!r})') from error
+        yield bag
 
 
 def _field_type(kind: Nodetype, content: Any) -> FieldType:
