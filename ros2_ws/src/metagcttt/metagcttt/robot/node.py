@@ -13,10 +13,10 @@ from metagcttt_interfaces.msg import ActionCommand, MazeState
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool
 
+from metagcttt.conventions import ConventionalNode
 from metagcttt.converters import state_message, to_array
 from metagcttt.diagnostics import Diagnostics
 from metagcttt.health import Faults, Health, Level, Rate
@@ -32,7 +32,7 @@ EPISODE = 1
 LEVELS = {'fault': Level.ERROR, 'stop': Level.WARN, 'silent': Level.WARN}
 
 
-class RobotBridgeNode(Node):
+class RobotBridgeNode(ConventionalNode):
     """Publishes a robot's state at the rate of its contract, and the policy's actions as commands.
 
     A robot is never reset, so there is one episode. Observations go by the node's clock; deadlines
