@@ -23,7 +23,8 @@ class Observer:
 
     A message is measured against the one before: it has to be newer and within reach. Once a topic
     has had no good message for `timeout_s` there is nothing to measure against, so that a robot
-    that was carried away, or whose clock was set back, is observed again after that time.
+    that was carried away is observed again after that time. One whose clock was set back, as a
+    simulation that starts again does, is observed again at once, and never by what came before.
 
     Attributes:
         segment: Counts unbroken stretches of observations from 1; the last one's number.
@@ -52,7 +53,8 @@ class Observer:
         """
         observed = self._topics[topic]
         before = self._newest.get(topic)
-        if before and received_ns - before.received_ns > _nanoseconds(observed.timeout_s):
+        silent_ns = received_ns - before.received_ns if before else 0
+        if not 0 <= silent_ns <= _nanoseconds(observed.timeout_s):  # or the clock was set back
             before = None
             self._is_broken = True
         try:
@@ -83,9 +85,11 @@ class Observer:
             newest = self._newest.get(name)
             if newest is None:
                 return f'{name}: no usable message yet'
-            if now_ns - newest.stamp_ns > _nanoseconds(topic.timeout_s):
-                age_s = (now_ns - newest.stamp_ns) / 1e9
-                return f'{name}: the newest usable message is {age_s:.2f} s old'
+            age_ns = now_ns - newest.stamp_ns
+            if age_ns > _nanoseconds(topic.timeout_s):
+                return f'{name}: the newest usable message is {age_ns / 1e9:.2f} s old'
+            if age_ns < -_nanoseconds(topic.timeout_s):
+                return f'{name}: the clock is {-age_ns / 1e9:.2f} s before the newest message'
         return ''
 
 

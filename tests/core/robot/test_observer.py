@@ -131,3 +131,14 @@ def test_joints_that_do_not_fit_are_refused(message, reason):
     observer = Observer(contract(ARM))
     assert reason in observer.take('joint_states', message, 0)
     assert observer.sample(0) is None
+
+
+def test_clock_that_was_set_back_leaves_nothing_of_before(observer):
+    """A simulation that starts again is observed at once, and by nothing that is from before."""
+    observer.take('odom', odometry(90 * SECOND, x=1.0), 90 * SECOND)
+    assert observer.sample(90 * SECOND)[0] == 1.0
+    assert observer.sample(SECOND) is None
+    assert observer.late == 'odom: the clock is 89.00 s before the newest message'
+    assert observer.take('odom', odometry(SECOND, x=7.0), SECOND) == ''
+    assert observer.sample(SECOND)[0] == 7.0
+    assert observer.segment == 2
