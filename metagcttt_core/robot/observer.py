@@ -38,6 +38,7 @@ class Observer:
             contract: The contract to evaluate.
         """
         self._topics = {topic.topic: topic for topic in contract.observe}
+        self._period_ns = contract.period_ns
         self._newest: dict[str, _Reading] = {}
         self._is_broken = True
         self.segment = 0
@@ -54,7 +55,8 @@ class Observer:
         observed = self._topics[topic]
         before = self._newest.get(topic)
         silent_ns = received_ns - before.received_ns if before else 0
-        if not 0 <= silent_ns <= _nanoseconds(observed.timeout_s):  # or the clock was set back
+        is_stale = silent_ns > _nanoseconds(observed.timeout_s) and observed.align != 'hold'
+        if is_stale or silent_ns < 0:  # less than none: the clock was set back
             before = None
             self._is_broken = True
         try:
@@ -69,6 +71,12 @@ class Observer:
             return f'{topic}: {error}'
         self._newest[topic] = _Reading(np.concatenate(parts), stamp_ns, received_ns)
         return ''
+
+    def begin_again(self) -> None:
+        """Forget what was observed before the clock went back, but for what is held."""
+        kept = self._newest.items()
+        self._newest = {name: each for name, each in kept if self._topics[name].align == 'hold'}
+        self._is_broken = True
 
     def sample(self, now_ns: int) -> NDArray[np.float64] | None:
         """The observation at `now_ns`, shape (obs_dim,); none while a topic is late."""
@@ -85,8 +93,12 @@ class Observer:
             newest = self._newest.get(name)
             if newest is None:
                 return f'{name}: no usable message yet'
+            if topic.align == 'hold':
+                continue
+            is_drop = topic.align == 'drop'
+            limit_ns = self._period_ns if is_drop else _nanoseconds(topic.timeout_s)
             age_ns = now_ns - newest.stamp_ns
-            if age_ns > _nanoseconds(topic.timeout_s):
+            if age_ns > limit_ns:
                 return f'{name}: the newest usable message is {age_ns / 1e9:.2f} s old'
             if age_ns < -_nanoseconds(topic.timeout_s):
                 return f'{name}: the clock is {-age_ns / 1e9:.2f} s before the newest message'
@@ -116,7 +128,8 @@ def _stamp(topic: ObservedTopic, message: Any, received_ns: int) -> int:
         return received_ns
     stamp_ns = stamp_of(message)
     behind_ns = received_ns - stamp_ns
-    if abs(behind_ns) > _nanoseconds(topic.timeout_s):
+    may_be_old = topic.align == 'hold' and behind_ns > 0
+    if abs(behind_ns) > _nanoseconds(topic.timeout_s) and not may_be_old:
         side = 'before' if behind_ns > 0 else 'after'
         raise MessageError(
             f'stamped {abs(behind_ns) / 1e9:g} s {side} its reception: late, or another clock'

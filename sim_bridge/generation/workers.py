@@ -83,11 +83,16 @@ def _workbench(environment: str, controller: Path | None) -> tuple[Simulator, Di
 
 
 def _prepare_worker() -> None:
-    """Leave Ctrl-C to the parent, and exit when the parent is gone.
+    """Leave Ctrl-C to the parent, and exit when the parent is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
+
+
+def end_with_parent() -> None:
+    """End this process when the one that started it is gone.
 
     Otherwise the workers of a killed parent would wait for work forever.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_exit_with, args=(parent.sentinel,), daemon=True).start()

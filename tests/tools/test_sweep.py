@@ -64,6 +64,11 @@ def study_of(preset, **different):
     return Study(SweepSettings.model_validate(values | different))
 
 
+def test_budgets_along_the_curve_are_those_of_its_end(preset):
+    with pytest.raises(ValueError, match=r'curve_budgets: 7 is not among .* \(0, 1\)'):
+        study_of(preset, curve_budgets=[0, 7])
+
+
 def test_each_run_differs_only_where_the_study_says(preset):
     study = study_of(preset)
     assert [run.seed for run in study.pretraining] == [0, 1]

@@ -171,6 +171,28 @@ def test_evaluate_writes_success_by_budget_and_seed(dataset_path, base, tmp_path
 
 
 @pytest.mark.mujoco
+@pytest.mark.mujoco
+@pytest.mark.slow
+@pytest.mark.skipif(not sys.platform.startswith('linux'), reason='looks for children in /proc')
+def test_workers_of_a_killed_evaluation_end(dataset_path, base, tmp_path):
+    arguments = ['--checkpoints', str(base), '--dataset', str(dataset_path), '--processes', '2']
+    arguments += ['--episodes', '500', '--out', str(tmp_path / 'evaluation.json')]
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'metagcttt_tools', 'evaluate', *arguments],
+        cwd=ROOT,
+        stderr=subprocess.DEVNULL,
+    )
+    children = Path(f'/proc/{process.pid}/task/{process.pid}/children')
+    wait_for(lambda: len(children.read_text().split()) >= 3, process)  # two, and a tracker
+    workers = [Path(f'/proc/{number}') for number in children.read_text().split()]
+    process.kill()
+    process.wait()
+    deadline = time.monotonic() + 60
+    while any(worker.exists() for worker in workers):
+        assert time.monotonic() < deadline, 'workers outlive the evaluation'
+        time.sleep(0.05)
+
+
 def test_evaluate_begins_with_the_optimizer_state_of_pretraining(
     dataset_path, base, tmp_path, capsys, monkeypatch
 ):

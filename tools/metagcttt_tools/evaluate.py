@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import as_completed, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 import multiprocessing
 from pathlib import Path
 import sys
@@ -21,6 +22,7 @@ from metagcttt_core.files import write_json
 import numpy as np
 from pydantic import Field
 from sim_bridge import make_simulator
+from sim_bridge.generation.workers import end_with_parent
 from tqdm import tqdm
 
 from metagcttt_tools.common.cli import fail, parse
@@ -208,6 +210,10 @@ def _run_jobs(settings: EvaluateSettings, program: Resumable, jobs: list[Job]) -
             for future in as_completed(futures):
                 log.add(futures[future], future.result())
                 bar.update()
+        except BrokenProcessPool as error:
+            raise ValueError(
+                'a worker process died (out of memory?): resume with fewer processes'
+            ) from error
         finally:
             pool.shutdown(cancel_futures=True)
     log.remove()
@@ -237,6 +243,7 @@ class _Worker:
 
 
 def _start_worker(settings: EvaluateSettings, fingerprints: Mapping[str, str]) -> None:
+    end_with_parent()
     use_threads(1)
     _Worker.settings = settings
     _Worker.fingerprints = fingerprints

@@ -162,7 +162,7 @@ STUDY = Walk(
         'adaptations': {'actor-only': {'ttt': {'actor_only': True}}},
         'dry_run': True,
         'curve': [0.5],
-        'curve_budgets': Proof([7], {'curve': [0.5]}),
+        'curve_budgets': Proof([0, 50], {'curve': [0.5]}),
         'processes': 1,
         'out': 'elsewhere',
     },

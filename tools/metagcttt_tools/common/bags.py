@@ -1,38 +1,46 @@
 """Opening of bags as recorded by ROS: folders, .mcap, .db3, split or compressed. No ROS."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, ExitStack
 from pathlib import Path
-import struct
 
 from metagcttt_core.data import DatasetError
-from rosbags.highlevel import AnyReader, AnyReaderError
-from rosbags.rosbag2 import ReaderError
-from rosbags.serde import SerdeError
+from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_typestore, Stores
 
 
 @contextmanager
 def open_any_bag(path: Path) -> Iterator[AnyReader]:
-    """A bag while it is read.
+    """A bag while it is read; whatever is taken from it belongs into `reading`.
 
     Args:
         path: Folder with `metadata.yaml`, or an .mcap or .db3 file. Bags of Humble hold no
             definitions of types; the standard ones of Humble stand in.
 
     Raises:
-        DatasetError: If the bag is missing or damaged, also while it is read.
+        DatasetError: If the bag is missing or damaged; those raised meanwhile name it, too.
+    """
+    humble = get_typestore(Stores.ROS2_HUMBLE)
+    with ExitStack() as stack:
+        with reading(path):
+            reader = stack.enter_context(AnyReader([path], default_typestore=humble))
+        try:
+            yield reader
+        except DatasetError as error:
+            named = str(error).startswith(str(path))
+            raise error if named else DatasetError(f'{path}: {error}') from error
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Where packages read a bag, which raise errors of any kind for damaged files.
+
+    Raises:
+        DatasetError: Instead of those; names the bag.
     """
     try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            yield reader
-    except DatasetError as error:
-        raise DatasetError(f'{path}: {error}') from error
+        yield
     except FileNotFoundError as error:
         raise DatasetError(f'{path}: no such bag ({error})') from error
-    # The packages below raise any of these for damaged files and messages.
-    except (
-        *(AnyReaderError, ReaderError, SerdeError, OSError, struct.error, RuntimeError),
-        *(AssertionError, LookupError, OverflowError, MemoryError, UnicodeDecodeError),
-    ) as error:
-        raise DatasetError(f'{path}: cannot be read as a bag ({error})') from error
+    except Exception as error:
+        raise DatasetError(f'{path}: cannot be read as a bag ({error!r})') from error

@@ -8,7 +8,7 @@ from mcap.records import Message
 from metagcttt_core.data.errors import DatasetError
 import yaml
 
-from metagcttt_tools.common.bags import open_any_bag
+from metagcttt_tools.common.bags import open_any_bag, reading
 from metagcttt_tools.recordings.mcap import Clocks, read_messages, Recorded, RecordedMessages
 
 
@@ -69,7 +69,7 @@ def _joined(parts: Sequence[RecordedMessages]) -> RecordedMessages:
 def _read_any(path: Path, type_names: Collection[str]) -> RecordedMessages:
     clocks = Clocks()
     messages: list[Recorded] = []
-    with open_any_bag(path) as reader:
+    with open_any_bag(path) as reader, reading(path):
         for connection, received_ns, data in reader.messages():
             wanted = connection.msgtype in type_names
             record = Message(

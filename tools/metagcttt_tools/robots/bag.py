@@ -12,7 +12,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
-from metagcttt_tools.common.bags import open_any_bag
+from metagcttt_tools.common.bags import open_any_bag, reading
 
 
 class Recorded(NamedTuple):
@@ -44,8 +44,9 @@ class Bag:
         definitions: The message types that the bag defines.
     """
 
-    def __init__(self, reader: AnyReader, contract: Contract, namespace: str) -> None:
+    def __init__(self, path: Path, reader: AnyReader, contract: Contract, namespace: str) -> None:
         """Find the topics of a contract in an open bag."""
+        self._path = path
         topics = [topic.topic for topic in contract.topics]
         names = {resolved(topic, namespace): topic for topic in topics}
         self._reader = reader
@@ -64,9 +65,10 @@ class Bag:
         connections = [connection for _, connection in self._connections.values()]
         if not connections:
             return
-        for connection, received_ns, data in self._reader.messages(connections):
-            message = self._reader.deserialize(data, connection.msgtype)
-            yield Recorded(self._names[connection.topic], message, received_ns)
+        with reading(self._path):
+            for connection, received_ns, data in self._reader.messages(connections):
+                message = self._reader.deserialize(data, connection.msgtype)
+                yield Recorded(self._names[connection.topic], message, received_ns)
 
 
 def resolved(topic: str, namespace: str) -> str:
@@ -91,7 +93,9 @@ def open_bag(path: Path, contract: Contract, namespace: str = '') -> Iterator[Ba
         DatasetError: If the bag is missing or damaged, also while it is read.
     """
     with open_any_bag(path) as reader:
-        yield Bag(reader, contract, namespace)
+        with reading(path):
+            bag = Bag(path, reader, contract, namespace)
+        yield bag
 
 
 def _field_type(kind: Nodetype, content: Any) -> FieldType:

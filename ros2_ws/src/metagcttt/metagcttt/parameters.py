@@ -151,6 +151,21 @@ POLICY_NODE = (
         changes='now',
     ),
     Parameter(
+        'engine',
+        'auto',
+        'what computes the gradient steps: kernels in C, the same in tensor operations, autograd; '
+        'auto: the first of them that policy and machine have',
+        choices=('auto', 'kernels', 'analytic', 'eager'),
+        changes='now',
+    ),
+    Parameter(
+        'precision',
+        'float32',
+        'of the matrix products; auto: bfloat16 where the machine gains by it',
+        choices=('float32', 'bfloat16', 'auto'),
+        changes='now',
+    ),
+    Parameter(
         'horizon',
         0,
         'control steps after which to adapt again from the base weights; 0: never',

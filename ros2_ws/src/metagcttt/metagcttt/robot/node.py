@@ -56,6 +56,7 @@ class RobotBridgeNode(ConventionalNode):
         self._contract = load_contract(Path(self._settings['contract']).expanduser())
         if faults := type_faults(self._contract, definitions):
             raise ContractError('\n'.join(faults))
+        self._observer = Observer(self._contract)
         self._pilot = Pilot(self._contract)
         self._begin_world()
         self._jumps = self.get_clock().create_jump_callback(
@@ -111,7 +112,7 @@ class RobotBridgeNode(ConventionalNode):
     def _begin_world(self) -> None:
         """Draw the identity of a world in which nothing was observed yet."""
         self._world_id = secrets.randbits(64) or 1  # 0 stands for none
-        self._observer = Observer(self._contract)
+        self._observer.begin_again()
         self._pilot.forget()
 
     def _on_time_back(self, jump: TimeJump) -> None:
