@@ -12,6 +12,7 @@ EXTRAS = {
     'mcap_ros2': 'recordings',
     'mujoco': 'mazes',
     'ogbench': 'mazes',
+    'ray': 'cluster',
     'rosbags': 'recordings',
     'scipy': 'plots',
     'tensorboard': 'plots',

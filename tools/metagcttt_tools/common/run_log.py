@@ -115,3 +115,14 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
     """The lines of a `metrics.jsonl`, in order; a last one cut short by a crash is left out."""
     *lines, _ = path.read_text(encoding='utf-8').split('\n')
     return [json.loads(line) for line in lines]
+
+
+def last_step(folder: Path) -> int:
+    """The step of the last line that the run in `folder` has logged; 0 before the first."""
+    path = folder / METRICS
+    if not path.exists():
+        return 0
+    with path.open('rb') as file:
+        file.seek(max(0, path.stat().st_size - 2**16))
+        lines = file.read().split(b'\n')[:-1]
+    return int(json.loads(lines[-1])['step']) if lines else 0
