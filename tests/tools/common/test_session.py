@@ -7,6 +7,7 @@ import resource
 import signal
 import subprocess
 import sys
+import time
 
 from metagcttt_core import load_checkpoint, make_agent, save_checkpoint
 from metagcttt_core.meta.diagnostics import Diagnostics
@@ -133,12 +134,13 @@ def test_unknown_device_is_refused_by_name(made, tmp_path, capsys):
         assert 'must be cpu, cuda or cuda:NUMBER' in capsys.readouterr().err
 
 
-def torchrun(processes, given):
-    """The tool in several processes of one machine."""
-    command = [sys.executable, '-m', 'torch.distributed.run', '--standalone']
-    command += [f'--nproc-per-node={processes}', '-m', 'metagcttt_tools', 'meta-train', *given]
-    environment = {**os.environ, 'OMP_NUM_THREADS': '1'}
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=environment)
+TORCHRUN = (sys.executable, '-m', 'torch.distributed.run', '--standalone')
+ENVIRONMENT = {**os.environ, 'OMP_NUM_THREADS': '1'}
+
+
+def torchrun(processes, given, *options):
+    """The command line of the tool in several processes of one machine."""
+    return [*TORCHRUN, f'--nproc-per-node={processes}', *options, *META_TRAIN[1:], *given]
 
 
 @pytest.mark.slow
@@ -147,12 +149,45 @@ def test_two_processes_give_the_policy_of_one(algorithm, tasks, made, tmp_path):
     settings = {'meta.algorithm': algorithm, 'meta.meta-batch-size': tasks, 'meta.inner-lr': 1e-3}
     alone, shared = tmp_path / 'alone', tmp_path / 'shared'
     meta_train.main(arguments(made, alone, **settings))
-    run = torchrun(2, arguments(made, shared, **settings))
+    command = torchrun(2, arguments(made, shared, **settings))
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=ENVIRONMENT)
     assert run.returncode == 0, run.stderr
     assert run.stdout.count('policy:') == 1
     assert_same_bits(weights(alone), weights(shared))
     assert without_times(alone) == without_times(shared)
     assert len(list((shared / 'tensorboard').iterdir())) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_killed_rank_restarts_all_from_the_checkpoint_to_the_same_bits(made, tmp_path):
+    settings = {'meta.algorithm': 'fomaml', 'meta.meta-batch-size': 2, 'checkpoint-every': 3}
+    steps, alone, shared = 150, tmp_path / 'alone', tmp_path / 'shared'
+    meta_train.main(arguments(made, alone, steps, **settings))
+    given = [*arguments(made, shared, steps, **settings), '--resume']
+    with (tmp_path / 'log').open('w+') as log:
+        elastic = subprocess.Popen(
+            torchrun(2, given, '--max-restarts=1'),
+            cwd=ROOT,
+            stdout=log,
+            stderr=log,
+            env=ENVIRONMENT,
+        )
+        children = Path(f'/proc/{elastic.pid}/task/{elastic.pid}/children')
+        while not (shared / 'checkpoint' / 'checkpoint.json').exists():
+            assert elastic.poll() is None, (tmp_path / 'log').read_text()
+            time.sleep(0.01)
+        ranks = [
+            process
+            for process in map(int, children.read_text().split())
+            if b'meta-train' in Path(f'/proc/{process}/cmdline').read_bytes()
+        ]
+        assert len(ranks) == 2
+        os.kill(ranks[1], signal.SIGKILL)
+        assert elastic.wait() == 0, (tmp_path / 'log').read_text()
+    assert 'continues after step' in (tmp_path / 'log').read_text()
+    assert_same_bits(weights(alone), weights(shared))
+    assert without_times(alone) == without_times(shared)
 
 
 def without_times(out):

@@ -184,7 +184,7 @@ BENCHMARK_INNER_LOOP = Walk(
 
 
 def watch_cluster(patch: pytest.MonkeyPatch, seen: Seen) -> None:
-    machines = SimpleNamespace(address='here', worker_nodes=[1, 2])
+    machines = SimpleNamespace(address='here')
     patch.setattr(cluster, 'two_machines', lambda: nullcontext(machines))
     schedulers = SimpleNamespace(RayScheduler=lambda resources: 'Ray')
     patch.setitem(sys.modules, 'metagcttt_tools.jobs.cluster', schedulers)

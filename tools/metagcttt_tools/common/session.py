@@ -214,13 +214,21 @@ def process_group(device: str) -> Iterator[None]:
     """Connects the processes that `torchrun` started; without it there is nothing to connect."""
     import torch
     from torch import distributed
+    from torch.distributed.distributed_c10d import PrefixStore
+    from torch.distributed.rendezvous import rendezvous
 
     if not distributed.is_torchelastic_launched():
         yield
         return
     if device == 'cuda':
         torch.cuda.set_device(int(os.environ['LOCAL_RANK']))
-    distributed.init_process_group('gloo' if device == 'cpu' else 'nccl')
+    store, rank, size = next(iter(rendezvous('env://')))
+    if os.environ['LOCAL_WORLD_SIZE'] == os.environ['WORLD_SIZE']:
+        # torchrun's store keeps the addresses of killed processes (pytorch #135712); between
+        # machines the count of restarts differs.
+        store = PrefixStore(os.environ['TORCHELASTIC_RESTART_COUNT'], store)
+    backend = 'gloo' if device == 'cpu' else 'nccl'
+    distributed.init_process_group(backend, store=store, rank=rank, world_size=size)
     try:
         yield
     finally:
