@@ -78,6 +78,7 @@ def run_inner_loop(
         train_losses=torch.stack(train_losses).tolist() if train_losses else [],
         test_losses=[] if best is None else best.losses,
         best_step=len(train_losses) if best is None else best.step,
+        engine=steps.name,
     )
 
 
@@ -121,5 +122,4 @@ def copy_weights(source: Agent, target: Agent) -> None:
 
 
 def _copy(weights: Sequence[torch.Tensor], into: Sequence[torch.Tensor]) -> None:
-    for weight, copied in zip(weights, into, strict=True):
-        copied.copy_(weight)
+    torch._foreach_copy_(list(into), list(weights))

@@ -1,6 +1,7 @@
 """Reading and writing npz files of arrays, without ever unpickling."""
 
 from collections.abc import Mapping, Sequence
+import json
 import logging
 import math
 import os
@@ -8,7 +9,7 @@ from pathlib import Path
 import shutil
 import tempfile
 from tokenize import TokenError
-from typing import IO, NamedTuple
+from typing import Any, IO, NamedTuple
 import zipfile
 import zlib
 
@@ -72,6 +73,28 @@ def read_arrays(
     # zipfile raises these for damaged, encrypted or unknown archives, besides its own error.
     except (zipfile.BadZipFile, RuntimeError, ValueError) as error:
         raise DatasetError(f'{path}: not a complete npz file ({error})') from error
+
+
+def read_json(path: Path, name: str) -> dict[str, Any] | None:
+    """The object that a text in an npz file holds as JSON; None where there is no such text.
+
+    Raises:
+        DatasetError: If the text is no JSON object.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if f'{name}.npy' not in archive.namelist():
+                return None
+            with archive.open(f'{name}.npy') as file:
+                text = np.lib.format.read_array(file, allow_pickle=False)
+        if text.ndim or text.dtype.kind != 'U':
+            raise ValueError(f'{text.dtype} of shape {text.shape}, no text')
+        content = json.loads(text.item())
+        if not isinstance(content, dict):
+            raise ValueError(f'a {type(content).__name__}, no object')
+    except (*_DAMAGE, *_BAD_HEADER, OSError, MemoryError, RecursionError) as error:
+        raise DatasetError(f'{path}: {name} is no JSON object ({error})') from error
+    return content
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:

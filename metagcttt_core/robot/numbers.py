@@ -43,7 +43,17 @@ def observe(value: ObservedValue, message: Any) -> NDArray[np.float64]:
     """
     if value.transform == 'heading':
         return _heading(value.field, message)
-    return read_numbers(value, message) - value.origin
+    return transformed(value, read_numbers(value, message))
+
+
+def transformed(value: ObservedValue, numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The observed values of numbers in units of the message."""
+    found = (numbers - value.origin) * value.scale
+    if value.transform == 'angle':
+        return np.concatenate([np.cos(found), np.sin(found)])
+    if value.transform == 'wrap':
+        return np.arctan2(np.sin(found), np.cos(found))
+    return found if value.clamp is None else np.clip(found, *value.clamp)
 
 
 def write_numbers(value: Numbers, message: Any, numbers: ArrayLike) -> None:

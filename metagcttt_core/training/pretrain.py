@@ -41,7 +41,11 @@ def pretrain(
 
     Returns:
         The trained copy, with the optimiser's state.
+
+    Raises:
+        DatasetError: If the data are outside the agent's scaling.
     """
+    agent.scaling.check(dataset)
     agent = agent.clone()
     run = run or TrainingRun('pretrain', {})
     relabeller = agent.relabeller(dataset)

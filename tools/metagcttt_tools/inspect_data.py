@@ -10,13 +10,14 @@ from metagcttt_core import TrajectoryDataset
 from metagcttt_core.config import Settings
 from metagcttt_core.data import DatasetError
 from metagcttt_core.data.inspection import Column, inspect, Inspection
-from metagcttt_core.robot import Contract, ContractError, load_contract
+from metagcttt_core.robot import ContractError, load_contract
 import numpy as np
 from pydantic import Field
 from tabulate import tabulate
 import tyro
 
 from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.names import names_of
 
 _DESCRIPTION = """Say what is in a dataset, and draw where it has been.
 
@@ -64,34 +65,6 @@ def main(argv: list[str] | None = None) -> None:
     places = dataset.observations[:, [x, y]]
     plots.save(plots.places_picture(places, names[0][x], names[0][y]), settings.out)
     print(f'coverage: {settings.out}')
-
-
-def names_of(
-    dataset: TrajectoryDataset, contract: Contract | None
-) -> tuple[Sequence[str], Sequence[str]]:
-    """The names of observed and commanded values.
-
-    Raises:
-        DatasetError: If the dataset is not of the contract.
-    """
-    if contract is None:
-        return (
-            [f'observation {i}' for i in range(dataset.obs_dim)],
-            [f'action {i}' for i in range(dataset.act_dim)],
-        )
-    sizes = (dataset.obs_dim, dataset.act_dim)
-    if sizes != (contract.obs_dim, contract.act_dim):
-        raise DatasetError(
-            f'{dataset.source}: {sizes[0]} observed and {sizes[1]} commanded values; the contract '
-            f'of {contract.robot} has {contract.obs_dim} and {contract.act_dim}'
-        )
-    commanded = [
-        f'{value.field} of {joint}' if joint else value.field
-        for topic in contract.act
-        for value in topic.values
-        for joint in (value.joints or [''] * value.num_values)
-    ]
-    return contract.columns, commanded
 
 
 def describe(found: Inspection, observed: Sequence[str], commanded: Sequence[str]) -> str:

@@ -1,12 +1,12 @@
 """Tables and figures of a study (paper, figures 3 to 5 and table 1)."""
 
-import json
+from collections.abc import Sequence
 from pathlib import Path
 import shlex
 from typing import Any
 
 from metagcttt_core import normalized_auc, success_statistics
-from metagcttt_core.config import Settings
+from metagcttt_core.config import error_lines, Settings
 from metagcttt_core.evaluation import (
     adaptation_efficiency,
     interquartile_mean,
@@ -14,16 +14,16 @@ from metagcttt_core.evaluation import (
     probability_of_improvement,
     stratified_bootstrap,
 )
-from metagcttt_core.files import write_json
+from metagcttt_core.files import read_json, write_json
 import numpy as np
-from pydantic import Field
+from pydantic import Field, ValidationError
 import tyro
 
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.differences import differences
 from metagcttt_tools.common.evidence import format_evidence, read_evidence
-from metagcttt_tools.common.manifest import BASE, Evaluation, Manifest
-from metagcttt_tools.common.results import markdown_table
+from metagcttt_tools.common.manifest import BASE, Evaluation, FILE, Manifest, Policy
+from metagcttt_tools.common.results import markdown_table, Point, Results
 
 _DESCRIPTION = """Tables and figures of a study that metagcttt sweep ran.
 
@@ -89,7 +89,7 @@ def rebuild(folder: Path) -> str:
     """
     evidence = read_evidence(folder / 'paper.yaml')
     for name in sorted({name for artefact in evidence.artefacts for name in artefact.files}):
-        results = _read_json(folder / name) if name.endswith('.json') else {}
+        results = read_json(folder / name) if name.endswith('.json') else {}
         if 'adaptations' in results:
             results['curve'] = {  # JSON has no numbers for names
                 arm: {float(fraction): point for fraction, point in points.items()}
@@ -201,9 +201,8 @@ def _restrict(summary: dict[str, Any], budgets: list[int]) -> dict[str, Any]:
 def _rates(folder: Path, evaluation: Evaluation) -> Rates:
     """The success rates in the file of an evaluation."""
     rates: Rates = {}
-    results = _read_json(folder / evaluation.file)['results']
-    for policy, result in zip(evaluation.policies, results, strict=True):
-        points = {point['budget']: point['success'] for point in result['curve']}
+    for policy, curve in _curves(folder, evaluation):
+        points = {point.budget: point.success for point in curve}
         rates.setdefault((policy.arm, policy.fraction), {})[policy.seed] = points
     return rates
 
@@ -211,13 +210,29 @@ def _rates(folder: Path, evaluation: Evaluation) -> Rates:
 def _task_rates(folder: Path, evaluation: Evaluation) -> TaskRates:
     """The success rates of each task in the file of an evaluation, where it has them."""
     rates: TaskRates = {}
-    results = _read_json(folder / evaluation.file)['results']
-    for policy, result in zip(evaluation.policies, results, strict=True):
-        for point in result['curve']:
-            if 'per_task' in point:
-                of_arm = rates.setdefault(policy.arm, {}).setdefault(point['budget'], [])
-                of_arm.append(list(point['per_task'].values()))
+    for policy, curve in _curves(folder, evaluation):
+        for point in curve:
+            if point.per_task:
+                of_arm = rates.setdefault(policy.arm, {}).setdefault(point.budget, [])
+                of_arm.append(list(point.per_task.values()))
     return rates
+
+
+def _curves(folder: Path, evaluation: Evaluation) -> list[tuple[Policy, Sequence[Point]]]:
+    """Each policy of an evaluation with its results."""
+    path = folder / evaluation.file
+    try:
+        results = Results.model_validate(read_json(path)).results
+    except FileNotFoundError as error:
+        raise ValueError(f'{path} does not exist: run metagcttt sweep to its end first') from error
+    except ValidationError as error:
+        raise ValueError(f'{path}: {"; ".join(error_lines(error))}') from error
+    if len(results) != len(evaluation.policies):
+        raise ValueError(
+            f'{path}: holds results of {len(results)} policies, '
+            f'{FILE} lists {len(evaluation.policies)}'
+        )
+    return [(p, r.curve) for p, r in zip(evaluation.policies, results, strict=True)]
 
 
 def robust_figures(rates: TaskRates) -> dict[str, dict[str, list[Interval]]]:
@@ -365,9 +380,3 @@ def _curve_table(curve: dict[str, Any]) -> str:
 def _cells(summary: dict[str, Any]) -> dict[str, str]:
     rates = zip(summary['budgets'], summary['success'], summary['standard_error'], strict=True)
     return {f'K = {budget}': f'{mean:.2f} ± {error:.2f}' for budget, mean, error in rates}
-
-
-def _read_json(path: Path) -> Any:
-    if not path.is_file():
-        raise ValueError(f'{path} does not exist: run metagcttt sweep to its end first')
-    return json.loads(path.read_text(encoding='utf-8'))

@@ -10,11 +10,11 @@ import sys
 import time
 
 from metagcttt_core import load_checkpoint, make_agent, save_checkpoint
+from metagcttt_core.files import read_json_lines
 from metagcttt_core.meta.diagnostics import Diagnostics
 from metagcttt_core.meta.registry import META_UPDATES
 from metagcttt_core.training.checkpoint import load_training_state
 from metagcttt_tools import meta_train
-from metagcttt_tools.common.run_log import read_metrics
 import pytest
 from tests.core.builders import maze_walks
 import torch
@@ -81,7 +81,9 @@ def test_full_disk_ends_the_run_and_leaves_the_last_checkpoint(made, tmp_path, m
     assert {p.name: p.read_bytes() for p in (broken / 'checkpoint').iterdir()} == before
     meta_train.main([*arguments(made, broken), '--resume'])
     assert_same_bits(weights(straight), weights(broken))
-    assert [line['step'] for line in read_metrics(broken / 'metrics.jsonl')] == list(range(1, 7))
+    assert [line['step'] for line in read_json_lines(broken / 'metrics.jsonl')] == list(
+        range(1, 7)
+    )
 
 
 def test_folder_that_cannot_be_made_is_one_line(made, tmp_path, capsys):
@@ -112,7 +114,7 @@ def test_diverging_run_names_the_weight_and_what_is_left(made, tmp_path, monkeyp
     assert 'outer step 4: weight actor.mean.bias is not finite' in error
     assert error.endswith('the checkpoint of step 3 is whole')
     assert load_training_state(tmp_path / 'checkpoint').step == 3
-    last = read_metrics(tmp_path / 'metrics.jsonl')[-1]
+    last = read_json_lines(tmp_path / 'metrics.jsonl')[-1]
     assert last['step'] == 4
     assert 'weight actor.mean.bias is not finite' in last['warnings'][0]
 
@@ -120,7 +122,7 @@ def test_diverging_run_names_the_weight_and_what_is_left(made, tmp_path, monkeyp
 def test_run_whose_inner_loops_are_rejected_says_so(made, tmp_path, capsys):
     settings = {'meta.inner-lr': 3.0}  # every step makes the loss worse
     meta_train.main(arguments(made, tmp_path, steps=20, **settings))
-    lines = read_metrics(tmp_path / 'metrics.jsonl')
+    lines = read_json_lines(tmp_path / 'metrics.jsonl')
     (told,) = [line for line in lines if 'warnings' in line]
     assert told['step'] == 20
     assert 'of the inner loops are rejected' in told['warnings'][0]
@@ -192,5 +194,5 @@ def test_a_killed_rank_restarts_all_from_the_checkpoint_to_the_same_bits(made, t
 
 def without_times(out):
     """The lines of a run's log that do not depend on the machine's speed."""
-    lines = read_metrics(out / 'metrics.jsonl')
+    lines = read_json_lines(out / 'metrics.jsonl')
     return [{key: line[key] for key in line.keys() - {'time', 'task/filter_ms'}} for line in lines]

@@ -2,7 +2,7 @@
 
 from contextlib import nullcontext
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from unittest import mock
 
 from metagcttt_tools import (
@@ -20,12 +20,13 @@ from metagcttt_tools.common import plots
 from metagcttt_tools.controller import humanoid
 from metagcttt_tools.recordings import goal_views, trajectories
 from metagcttt_tools.robots import bag, episodes, report
+from metagcttt_tools.tables import lerobot, lerobot_writer
 import numpy as np
 import ogbench
 import pytest
 from sim_bridge.controllers.direction import BUNDLED
 from sim_bridge.controllers.walk import GoalRun
-from tests.core.builders import random_dataset
+from tests.core.builders import DATA, random_dataset
 from tests.core.robot.messages import contract
 from tests.tools.settings.walk import (
     note_time_limits,
@@ -154,6 +155,60 @@ IMPORT_BAGS = Walk(
     },
     watch_bags,
 )
+
+
+IMPORT_TABLE = Walk(
+    'import-table',
+    {'tables': ['@table.csv'], 'columns': '@by-run.yaml'},
+    {
+        'tables': ['@table.csv', '@table.csv'],
+        'columns': '@by-v.yaml',
+        'limits_from_data': True,
+        'out': 'elsewhere.npz',
+        'overwrite': Proof(True, again=True),
+    },
+)
+PUSHT = str(DATA / 'lerobot_pusht')
+IMPORT_LEROBOT = Walk(
+    'import-lerobot',
+    {'folder': PUSHT, 'columns': '@state.yaml'},
+    {
+        'folder': Proof('nowhere', refused='no LeRobot dataset there'),
+        'columns': '@action.yaml',
+        'contract': Proof(
+            '@cart.yaml', {'columns': None, 'limits_from_data': True}, refused="no value 'x'"
+        ),
+        'limits_from_data': True,
+        'trust_rows': True,
+        'out': 'elsewhere.npz',
+        'overwrite': Proof(True, again=True),
+    },
+    lambda patch, seen: note_calls(patch, seen, lerobot, 'read_lerobot'),
+)
+EXPORT_LEROBOT = Walk(
+    'export-lerobot',
+    {'data': '@cart.npz', 'fps': 5},
+    {
+        'data': '@walks.npz',
+        'contract': '@cart.yaml',
+        'fps': 7,
+        'task': Proof('push'),
+        'rows_per_file': 3,
+        'out': 'elsewhere',
+    },
+    lambda patch, seen: note_calls(patch, seen, lerobot_writer, 'write_lerobot'),
+)
+
+
+def note_calls(patch: pytest.MonkeyPatch, seen: Seen, module: ModuleType, name: str) -> None:
+    """Note the settings that a function is called with, and call it."""
+    function = getattr(module, name)
+
+    def noting(*given, **named):
+        seen.append(named)
+        return function(*given, **named)
+
+    patch.setattr(module, name, noting)
 
 
 def watch_inspection(patch: pytest.MonkeyPatch, seen: Seen) -> None:
@@ -387,6 +442,9 @@ WALKS = (
     DOWNLOAD,
     IMPORT,
     IMPORT_BAGS,
+    IMPORT_TABLE,
+    IMPORT_LEROBOT,
+    EXPORT_LEROBOT,
     CONTRACT_CHECK,
     INSPECT,
     CONVERT,

@@ -149,7 +149,7 @@ def watch_study(patch: pytest.MonkeyPatch, seen: Seen) -> None:
     patch.setattr(sweep, 'format_estimate', lambda *runs: seen.append(runs))
 
     def ran(tool, jobs, scheduler, stop):
-        shown = [(job.invocation.program, job.size, job.cpus) for job in jobs]
+        shown = [(job.invocation.preset.read_text(), job.size, job.cpus) for job in jobs]
         seen.append((tool, shown, scheduler))
 
     patch.setattr(sweep, 'run_all', ran)

@@ -12,6 +12,7 @@ EXTRAS = {
     'mcap_ros2': 'recordings',
     'mujoco': 'mazes',
     'ogbench': 'mazes',
+    'pyarrow': 'tables',
     'ray': 'cluster',
     'rosbags': 'recordings',
     'scipy': 'plots',

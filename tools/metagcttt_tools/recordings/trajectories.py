@@ -10,7 +10,8 @@ from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.data.errors import DatasetError
 import numpy as np
 
-from metagcttt_tools.recordings.mcap import read_messages, Recorded, RecordedMessages
+from metagcttt_tools.recordings.bags import read_bag
+from metagcttt_tools.recordings.mcap import Recorded, RecordedMessages
 from metagcttt_tools.recordings.robot import MISFITS, OTHER_STATE, Robot, usual_period_s
 
 STATE = 'metagcttt_interfaces/msg/MazeState'
@@ -50,7 +51,8 @@ def read_recordings(
     the robot.
 
     Args:
-        paths: Files of recorder_node or `ros2 bag record`; those of one split recording in order.
+        paths: Files or folders of recorder_node or `ros2 bag record`; the files of one split
+            recording in order.
         keep_idle: Keep steps in which the robot had no goal.
         refuse_gaps: Fail where a trajectory would be cut, but for idle steps.
 
@@ -64,7 +66,7 @@ def read_recordings(
     """
     if not paths:
         raise DatasetError('no recordings were given')
-    contents = [read_messages(path, (STATE, ACTION)) for path in paths]
+    contents = [read_bag(path, (STATE, ACTION)) for path in paths]
     by_robot = _by_robot(contents)
     dropped: Counter[str] = Counter()
     trajectories: list[tuple[np.ndarray, np.ndarray]] = []

@@ -3,18 +3,16 @@
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-import struct
 from typing import Any, NamedTuple
 
-from metagcttt_core.data import DatasetError
 from metagcttt_core.robot import Contract
 from metagcttt_core.robot.types import FieldType
-from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Nodetype
-from rosbags.rosbag2 import ReaderError
-from rosbags.serde import SerdeError
 from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
+
+from metagcttt_tools.common.bags import open_any_bag, reading
 
 
 class Recorded(NamedTuple):
@@ -46,8 +44,9 @@ class Bag:
         definitions: The message types that the bag defines.
     """
 
-    def __init__(self, reader: AnyReader, contract: Contract, namespace: str) -> None:
+    def __init__(self, path: Path, reader: AnyReader, contract: Contract, namespace: str) -> None:
         """Find the topics of a contract in an open bag."""
+        self._path = path
         topics = [topic.topic for topic in contract.topics]
         names = {resolved(topic, namespace): topic for topic in topics}
         self._reader = reader
@@ -66,9 +65,10 @@ class Bag:
         connections = [connection for _, connection in self._connections.values()]
         if not connections:
             return
-        for connection, received_ns, data in self._reader.messages(connections):
-            message = self._reader.deserialize(data, connection.msgtype)
-            yield Recorded(self._names[connection.topic], message, received_ns)
+        with reading(self._path):
+            for connection, received_ns, data in self._reader.messages(connections):
+                message = self._reader.deserialize(data, connection.msgtype)
+                yield Recorded(self._names[connection.topic], message, received_ns)
 
 
 def resolved(topic: str, namespace: str) -> str:
@@ -92,20 +92,10 @@ def open_bag(path: Path, contract: Contract, namespace: str = '') -> Iterator[Ba
     Raises:
         DatasetError: If the bag is missing or damaged, also while it is read.
     """
-    try:
-        humble = get_typestore(Stores.ROS2_HUMBLE)
-        with AnyReader([path], default_typestore=humble) as reader:
-            yield Bag(reader, contract, namespace)
-    except DatasetError as error:
-        raise DatasetError(f'{path}: {error}') from error
-    except FileNotFoundError as error:
-        raise DatasetError(f'{path}: no such bag ({error})') from error
-    # The packages below raise any of these for damaged files and messages.
-    except (
-        *(AnyReaderError, ReaderError, SerdeError, OSError, struct.error, RuntimeError),
-        *(AssertionError, LookupError, OverflowError, MemoryError, UnicodeDecodeError),
-    ) as error:
-        raise DatasetError(f'{path}: cannot be read as a bag ({error})') from error
+    with open_any_bag(path) as reader:
+        with reading(path):
+            bag = Bag(path, reader, contract, namespace)
+        yield bag
 
 
 def _field_type(kind: Nodetype, content: Any) -> FieldType:

@@ -151,6 +151,21 @@ POLICY_NODE = (
         changes='now',
     ),
     Parameter(
+        'engine',
+        'auto',
+        'what computes the gradient steps: kernels in C, the same in tensor operations, autograd; '
+        'auto: the first of them that policy and machine have',
+        choices=('auto', 'kernels', 'analytic', 'eager'),
+        changes='now',
+    ),
+    Parameter(
+        'precision',
+        'float32',
+        'of the matrix products; auto: bfloat16 where the machine gains by it',
+        choices=('float32', 'bfloat16', 'auto'),
+        changes='now',
+    ),
+    Parameter(
         'horizon',
         0,
         'control steps after which to adapt again from the base weights; 0: never',
@@ -241,7 +256,14 @@ POLICY_NODE = (
 
 RECORDER_NODE = (
     Parameter(
-        'output', '', 'file to write (.mcap), which must not exist; empty: ./rec-DATE-TIME.mcap'
+        'output',
+        '',
+        'file (.mcap) or bag folder to write, which must not exist; empty: ./rec-DATE-TIME.mcap',
+    ),
+    Parameter(
+        'hidden_topics',
+        False,
+        'record hidden topics too, such as the feedback and the status of actions',
     ),
     Parameter('split_mb', 0.0, 'start a new file at this size, megabytes; 0: never', (0, 1000000)),
     Parameter(

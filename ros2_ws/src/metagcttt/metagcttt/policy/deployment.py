@@ -14,6 +14,8 @@ from metagcttt_core import (
     TTTConfig,
 )
 from metagcttt_core.adaptation import AdaptationCancelled, OnStep
+from metagcttt_core.adaptation.config import EngineName
+from metagcttt_core.adaptation.inner_loop import run_inner_loop
 from metagcttt_core.config.assets import checkpoint_path, dataset_path
 from metagcttt_core.retrieval.value_cache import ValueFunction
 from metagcttt_core.training.optimizers import pretrained_state
@@ -43,6 +45,14 @@ class Deployment:
         """
         if choice == 'pretrained':
             pretrained_state(self.agent)
+
+    def check_engine(self, name: EngineName) -> None:
+        """Refuse an engine that policy or machine do not have.
+
+        Raises:
+            ValueError: With the reason.
+        """
+        run_inner_loop(self.agent, [], lr=0.0, engine=name)
 
 
 @dataclass(frozen=True)
@@ -85,18 +95,32 @@ def load_deployment(checkpoint: str, dataset: str, config: FilterConfig) -> Depl
     return Deployment(agent, TrajectoryFilter(data, config))
 
 
-def warm_up(deployment: Deployment) -> None:
-    """Take one gradient step and discard it; policy and dataset are not changed.
+def warm_up(deployment: Deployment, config: TTTConfig) -> str:
+    """Take one gradient step, as `config` will, and discard it; no goal waits for it later.
 
-    At the first step PyTorch imports and initialises for a second or two, which would stall the
-    control loop.
+    At the first step PyTorch imports and initialises for a second or two, and kernels that this
+    machine does not have yet are compiled.
+
+    Returns:
+        The engine that took it.
+
+    Raises:
+        ValueError: If policy or machine do not have the engine that is asked for.
     """
-    observation = np.asarray(deployment.dataset.observations[0], dtype=np.float64)
-    agent, trajectory_filter = deployment.agent, deployment.trajectory_filter
-    support = trajectory_filter.query(observation, observation, agent.value_fn)
-    config = TTTConfig(steps=1, batch_size=2)
-    adapt(agent, deployment.dataset, support, observation, config)
+    agent, dataset = deployment.agent, deployment.dataset
+    observation = np.asarray(dataset.states(0), dtype=np.float64)
+    deployment.trajectory_filter.query(observation, observation, agent.value_fn)
+    batch = agent.relabeller(dataset).sample(config.batch_size, np.random.default_rng(0))
+    step = run_inner_loop(
+        agent,
+        [agent.tensors(batch)],
+        lr=config.lr,
+        actor_only=config.actor_only,
+        engine=config.engine,
+        precision=config.precision,
+    )
     agent.act(observation, observation)
+    return step.engine
 
 
 def adapt_to_goal(
