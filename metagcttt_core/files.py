@@ -42,6 +42,37 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
         file.write((json.dumps(content, indent=2) + '\n').encode())
 
 
+def read_json(path: Path) -> dict[str, Any]:
+    """The JSON object in a file.
+
+    Raises:
+        FileNotFoundError: If there is none.
+        ValueError: If it holds anything else; names the file.
+    """
+    return _object(path, path.read_bytes())
+
+
+def read_json_lines(path: Path) -> list[dict[str, Any]]:
+    """The JSON objects in a file, one a line; a last one cut short by a crash is left out.
+
+    Raises:
+        FileNotFoundError: If there is none.
+        ValueError: If it holds anything else; names file and line.
+    """
+    *lines, _ = path.read_bytes().split(b'\n')
+    return [_object(f'{path}:{number}', line) for number, line in enumerate(lines, 1)]
+
+
+def _object(place: Path | str, text: bytes) -> dict[str, Any]:
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f'{place}: not valid JSON ({error})') from error
+    if not isinstance(content, dict):
+        raise ValueError(f'{place}: must hold a JSON object, got {type(content).__name__}')
+    return content
+
+
 def claim_folder(path: Path) -> None:
     """Create a folder that carries our mark, or reopen one.
 

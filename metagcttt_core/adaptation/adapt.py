@@ -119,6 +119,7 @@ def _check(agent: Agent, dataset: TrajectoryDataset, goal: np.ndarray) -> None:
                 f'{name} is {getattr(agent, name)} for the agent '
                 f'and {getattr(dataset, name)} for the dataset; they must match'
             )
+    agent.scaling.check(dataset)
     if np.shape(goal) != (agent.obs_dim,):
         raise ValueError(f'goal must have shape ({agent.obs_dim},), got {np.shape(goal)}')
     if not np.isfinite(goal).all():

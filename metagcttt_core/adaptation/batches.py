@@ -40,7 +40,7 @@ class QueryBatches:
         self.rows = rows[~dataset.terminals[rows]]
         self._agent = agent
         self._relabeller = agent.relabeller(dataset)
-        self._goal = np.asarray(goal, dtype=np.float32)
+        self._goal = agent.scaling.observations(goal)
         self._fix_actor_goal = fix_actor_goal
         self._ratio = ratio
 

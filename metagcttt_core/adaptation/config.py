@@ -5,9 +5,7 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from metagcttt_core.config.settings import Settings
-from metagcttt_core.training.config import OptimizerName, Precision
-
-EngineName = Literal['auto', 'eager']
+from metagcttt_core.training.config import EngineName, OptimizerName, Precision
 
 
 class InnerLoopConfig(Settings):
@@ -23,7 +21,7 @@ class InnerLoopConfig(Settings):
         1.0, ge=0, le=1, description="probability that an actor goal is the query's goal"
     )
     engine: EngineName = Field(
-        'auto', description='gradients written out where the agent has them, or by autograd'
+        'auto', description='what computes the steps; the fastest that agent and machine have'
     )
     precision: Precision = Field(
         'float32', description='of matrix products; weights and optimiser stay float32'

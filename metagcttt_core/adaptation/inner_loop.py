@@ -7,11 +7,10 @@ import math
 import torch
 from torch.profiler import record_function
 
-from metagcttt_core.adaptation.config import EngineName
-from metagcttt_core.adaptation.engine import make_engine
 from metagcttt_core.adaptation.result import Adaptation, AdaptationCancelled, OnStep
 from metagcttt_core.agents.agent import Agent, OptimizerState, TensorBatch
-from metagcttt_core.training.config import OptimizerName, Precision
+from metagcttt_core.training.config import EngineName, OptimizerName, Precision
+from metagcttt_core.training.engine import make_engine
 from metagcttt_core.training.optimizers import make_optimizer
 
 INNER_STEP, TEST_LOSS = 'inner step', 'test loss'
@@ -78,6 +77,7 @@ def run_inner_loop(
         train_losses=torch.stack(train_losses).tolist() if train_losses else [],
         test_losses=[] if best is None else best.losses,
         best_step=len(train_losses) if best is None else best.step,
+        engine=steps.name,
     )
 
 
@@ -121,5 +121,4 @@ def copy_weights(source: Agent, target: Agent) -> None:
 
 
 def _copy(weights: Sequence[torch.Tensor], into: Sequence[torch.Tensor]) -> None:
-    for weight, copied in zip(weights, into, strict=True):
-        copied.copy_(weight)
+    torch._foreach_copy_(list(into), list(weights))

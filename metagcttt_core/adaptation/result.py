@@ -28,6 +28,7 @@ class Adaptation:
         test_losses: (K + 1,) held-out loss after 0..K steps; empty without early stopping.
         best_step: k* (paper, equation 9): the number of gradient steps behind `agent`'s weights.
         reason: Why it was not accepted; empty if it was.
+        engine: What computed the steps; empty where none were asked for.
         support: The transitions it was adapted on, with the time the filter took; None where no
             filter ran.
         seconds: Time the inner loop took.
@@ -38,6 +39,7 @@ class Adaptation:
     test_losses: list[float] = field(default_factory=list)
     best_step: int = 0
     reason: str = ''
+    engine: str = ''
     support: SupportSet | None = None
     seconds: float = 0.0
 

@@ -15,9 +15,11 @@ from metagcttt_core.agents.config import AgentSettings
 from metagcttt_core.agents.networks import MLP
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.data.relabel import GoalRelabeller
+from metagcttt_core.data.scaling import Scaling
 
 if TYPE_CHECKING:
     from metagcttt_core.agents.analytic import AnalyticLoss
+    from metagcttt_core.kernels import Kernels
 
 TensorBatch = dict[str, Tensor]
 OptimizerState = dict[int, dict[str, Tensor]]
@@ -31,6 +33,8 @@ class Agent(nn.Module, ABC):
     Attributes:
         obs_dim, act_dim: Widths of an observation (and goal) and of an action.
         settings: The agent's settings, defaults resolved.
+        scaling: Between physical units, which everything public here takes and gives, and those
+            of the networks; the identity at first. It travels with the weights.
         metadata: Facts that travel with the weights (`environment`, `history`, ...).
         optimizer_state: Adam's at the end of pre-training, by number in `trained_parameters()`,
             None where it is not known. It travels with the weights, whatever is done to them, and
@@ -56,6 +60,7 @@ class Agent(nn.Module, ABC):
         self.obs_dim = obs_dim
         self.act_dim = act_dim
         self.settings = settings
+        self.scaling = Scaling.identity(obs_dim, act_dim)
         self.metadata: dict[str, Any] = {}
         self.optimizer_state: OptimizerState | None = None
         self.origin = 'the agent'
@@ -95,13 +100,18 @@ class Agent(nn.Module, ABC):
         """Move the networks that trail others; called with each full update, before its step."""
 
     def analytic_loss(
-        self, *, actor_only: bool = False, dtype: torch.dtype = torch.float32
+        self,
+        *,
+        actor_only: bool = False,
+        dtype: torch.dtype = torch.float32,
+        kernels: 'Kernels | None' = None,
     ) -> 'AnalyticLoss | None':
         """The same loss with its gradient written out, or None where `losses` is all there is.
 
         Args:
             actor_only: Leave out the terms that do not train the actor.
             dtype: Of the operands of matrix products.
+            kernels: Compute by these, from `load_kernels`; in tensor operations by default.
         """
         return None
 
@@ -112,7 +122,9 @@ class Agent(nn.Module, ABC):
 
     def relabeller(self, dataset: TrajectoryDataset) -> GoalRelabeller:
         """The source of batches that `losses` takes."""
-        return GoalRelabeller(dataset, self.settings.goals, self.settings.discount)
+        return GoalRelabeller(
+            dataset, self.settings.goals, self.settings.discount, scaling=self.scaling
+        )
 
     def trained_parameters(self, *, actor_only: bool = False) -> Iterator[nn.Parameter]:
         """The parameters an optimiser steps on."""
@@ -125,12 +137,15 @@ class Agent(nn.Module, ABC):
         for name, weight in self.state_dict().items():
             digest.update(f'{name}{tuple(weight.shape)}'.encode())
             digest.update(weight.cpu().numpy().tobytes())
+        if not self.scaling.is_identity:
+            digest.update(repr(self.scaling.to_json()).encode())
         return digest.hexdigest()
 
     def clone(self) -> Self:
         """An independent copy with equal weights, and the same optimiser state."""
-        # Twice as large as the weights and never changed: shared instead of copied.
-        return copy.deepcopy(self, {id(self.optimizer_state): self.optimizer_state})
+        # Never changed, and as large as the weights or slow to copy: shared.
+        shared = (self.optimizer_state, self.settings)
+        return copy.deepcopy(self, {id(part): part for part in shared})
 
     def log_prob(
         self, observations: Tensor, goals: Tensor, actions: Tensor
@@ -158,7 +173,7 @@ class Agent(nn.Module, ABC):
         temperature: float = 0.0,
         rng: np.random.Generator | None = None,
     ) -> np.ndarray:
-        """The action for one observation or a batch: the policy's mode, clipped to [-1, 1].
+        """The action for one observation or a batch: the policy's mode, within its limits.
 
         Args:
             observation: (obs_dim,) or (n, obs_dim), finite.
@@ -167,7 +182,8 @@ class Agent(nn.Module, ABC):
             rng: Source of the noise; needed when the temperature is above 0.
 
         Returns:
-            (act_dim,) or (n, act_dim) float32.
+            (act_dim,) or (n, act_dim) float32, clipped to `scaling.limit` either way: 1 unless the
+            policy was trained on larger actions.
 
         Raises:
             ValueError: For a wrong width or a non-finite value.
@@ -180,14 +196,15 @@ class Agent(nn.Module, ABC):
             raise ValueError(
                 f'goal of shape {goal.shape} does not fit observation of shape {observation.shape}'
             )
-        inputs = torch.from_numpy(np.concatenate([observation, goal], axis=-1))
+        seen = [self.scaling.observations(each) for each in (observation, goal)]
+        inputs = torch.from_numpy(np.concatenate(seen, axis=-1))
         mean = self.actor(inputs.to(self.device)).cpu().numpy()
         if temperature > 0:
             if rng is None:
                 raise ValueError('acting with a temperature above 0 needs an rng')
             std = 1.0 if self.settings.const_std else log_std_of(self.actor).exp().cpu().numpy()
             mean = mean + temperature * std * rng.standard_normal(mean.shape, dtype=np.float32)
-        return np.clip(mean, -1, 1)
+        return self.scaling.physical_actions(np.clip(mean, -1, 1))
 
     def _has_analytic_loss_of(self, agent_type: type['Agent']) -> bool:
         """True if the loss written out for `agent_type` is this agent's, no subclass's."""
@@ -267,9 +284,11 @@ def _reference_name(name: str, tensor: Tensor) -> str:
 
 
 def _checked(name: str, values: np.ndarray, width: int) -> np.ndarray:
-    array = np.asarray(values, dtype=np.float32)
+    array = np.asarray(values)
     if array.ndim not in (1, 2) or array.shape[-1] != width:
         raise ValueError(f'{name} must have shape ({width},) or (n, {width}), got {array.shape}')
-    if not np.isfinite(array).all():
+    with np.errstate(over='ignore'):
+        finite = np.isfinite(array.astype(np.float32)).all()
+    if not finite:
         raise ValueError(f'{name} holds a non-finite value')
     return array

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from metagcttt_core.agents.agent import Agent, TensorBatch
-from metagcttt_core.agents.passes import Passes
+from metagcttt_core.agents.passes import passes_of
+from metagcttt_core.kernels import Kernels
 
 HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
 
@@ -31,28 +32,20 @@ class AnalyticLoss(ABC):
 class Cloning(AnalyticLoss):
     """Negative log-likelihood of the actions with unit standard deviation, of GCBC."""
 
-    def __init__(self, agent: Agent, dtype: torch.dtype) -> None:
+    def __init__(self, agent: Agent, dtype: torch.dtype, kernels: Kernels | None = None) -> None:
         """The loss of `agent`, with matrix products in `dtype`."""
-        self.actor = Passes(agent.actor, dtype=dtype)
-        self.gradients = self.actor.gradients
+        self._actor = passes_of(agent.actor, dtype, kernels)
+        self.gradients = self._actor.gradients
 
     @torch.no_grad()
     def __call__(
         self, batch: TensorBatch, *, backward: bool = True
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """See `AnalyticLoss`."""
-        error, _ = self.error(batch)
-        loss, mse = cloning_loss(error), error.square().mean()
+        states = torch.cat([batch['observations'], batch['actor_goals']], dim=-1)
+        error = self._actor.forward(states).sub_(batch['actions'])
+        mse = error.square().mean()
+        loss = mse * (0.5 * error.shape[1]) + error.shape[1] * HALF_LOG_TWO_PI
         if backward:
-            self.actor.backward(error.div_(len(error)))
+            self._actor.backward(error.div_(len(error)))
         return loss, {'bc': loss, 'mse': mse}
-
-    def error(self, batch: TensorBatch) -> tuple[Tensor, Tensor]:
-        """The policy's means minus the actions, and the means, each (B, act_dim)."""
-        mean = self.actor.forward(torch.cat([batch['observations'], batch['actor_goals']], dim=-1))
-        return mean - batch['actions'], mean
-
-
-def cloning_loss(error: Tensor) -> Tensor:
-    """The mean of -log pi over a batch whose means err by `error` (B, act_dim)."""
-    return error.square().sum(-1).mul_(0.5).mean() + error.shape[1] * HALF_LOG_TWO_PI

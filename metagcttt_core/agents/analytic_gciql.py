@@ -1,26 +1,45 @@
 """The losses of GCIQL with gradients written out (paper, equations 3 and 4)."""
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from metagcttt_core.agents.agent import TensorBatch
-from metagcttt_core.agents.analytic import AnalyticLoss, Cloning, cloning_loss, HALF_LOG_TWO_PI
+from metagcttt_core.agents.analytic import AnalyticLoss, HALF_LOG_TWO_PI
 from metagcttt_core.agents.gciql import GCIQL
-from metagcttt_core.agents.passes import Passes
+from metagcttt_core.agents.passes import Passes, passes_of
+from metagcttt_core.kernels import Kernels
+
+Arrays = dict[str, np.ndarray]
 
 
 class AnalyticGCIQL(AnalyticLoss):
-    """`GCIQL.losses` of an agent whose actor has unit standard deviation."""
+    """`GCIQL.losses` of an agent whose actor has unit standard deviation.
 
-    def __init__(self, agent: GCIQL, dtype: torch.dtype, *, actor_only: bool) -> None:
+    Between the passes of the networks there are some seventy operations on a number or two per
+    transition: in NumPy, which takes a microsecond for what costs PyTorch five.
+    """
+
+    def __init__(
+        self,
+        agent: GCIQL,
+        dtype: torch.dtype,
+        kernels: Kernels | None = None,
+        *,
+        actor_only: bool,
+    ) -> None:
         """The loss of `agent`, with matrix products in `dtype`."""
         self._settings = agent.settings
         self._actor_only = actor_only
-        self._cloning = Cloning(agent, dtype)
-        self._value = Passes(agent.value, dtype=dtype)
-        self._critics = [Passes(net, dtype=dtype) for net in (agent.critic1, agent.critic2)]
-        self._targets = [Passes(net, dtype=dtype) for net in (agent.target1, agent.target2)]
-        networks = [self._cloning.actor]
+        self._actor, self._value, *critics = (
+            passes_of(network, dtype, kernels)
+            for network in (
+                *(agent.actor, agent.value, agent.critic1, agent.critic2),
+                *(agent.target1, agent.target2),
+            )
+        )
+        self._critics, self._targets = critics[:2], critics[2:]
+        networks = [self._actor]
         if not actor_only:
             networks += [self._value, *self._critics]
         self.gradients = [gradient for network in networks for gradient in network.gradients]
@@ -30,75 +49,93 @@ class AnalyticGCIQL(AnalyticLoss):
         self, batch: TensorBatch, *, backward: bool = True
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """See `AnalyticLoss`."""
-        loss, parts = self._actor_loss(batch, backward)
-        if self._actor_only:
-            return loss, parts
-        states = torch.cat([batch['observations'], batch['value_goals']], dim=-1)
-        inputs = torch.cat([states, batch['actions']], dim=-1)
-        value = self._value_loss(states, inputs, backward)
-        critic = self._critic_loss(inputs, batch, backward)
-        return value + critic + loss, parts | {'value': value, 'critic': critic}
+        arrays = {key: values.numpy() for key, values in batch.items()}
+        loss, parts = self._actor_loss(arrays, backward)
+        if not self._actor_only:
+            states = _join(arrays['observations'], arrays['value_goals'])
+            inputs = _join(states, arrays['actions'])
+            parts['value'] = self._value_loss(states, inputs, backward)
+            parts['critic'] = self._critic_loss(inputs, arrays, backward)
+            loss = loss + parts['value'] + parts['critic']
+        return torch.as_tensor(loss), {name: torch.as_tensor(part) for name, part in parts.items()}
 
-    def _value_loss(self, states: Tensor, inputs: Tensor, backward: bool) -> Tensor:
-        error = torch.minimum(*(target.forward(inputs) for target in self._targets))
-        error -= self._value.forward(states)
+    def _value_loss(self, states: np.ndarray, inputs: np.ndarray, backward: bool) -> np.float32:
+        error = np.minimum(*(_outputs(target, inputs) for target in self._targets))
+        error -= _outputs(self._value, states)
         expectile = self._settings.expectile
-        weighted = torch.where(error >= 0, expectile, 1 - expectile).mul_(error)
-        loss = (weighted * error).mean()
+        weighted = error * np.where(error >= 0, np.float32(expectile), np.float32(1 - expectile))
         if backward:
-            self._value.backward(weighted.mul_(-2 / len(error)))
+            _backward(self._value, weighted * np.float32(-2 / len(error)))
+        return (weighted * error).mean()
+
+    def _critic_loss(self, inputs: np.ndarray, batch: Arrays, backward: bool) -> np.float32:
+        following = _join(batch['next_observations'], batch['value_goals'])
+        # The gradient of V is taken: its passes are free again.
+        next_v = _outputs(self._value, following)[:, 0]
+        target = batch['rewards'] + np.float32(self._settings.discount) * batch['masks'] * next_v
+        loss = np.float32(0)
+        for critic in self._critics:
+            error = _outputs(critic, inputs) - target[:, None]
+            loss += np.square(error).mean()
+            if backward:
+                _backward(critic, error * np.float32(2 / len(error)))
         return loss
 
-    def _critic_loss(self, inputs: Tensor, batch: TensorBatch, backward: bool) -> Tensor:
-        following = torch.cat([batch['next_observations'], batch['value_goals']], dim=-1)
-        # The gradient of V is taken: its passes are free again.
-        next_v = self._value.forward(following).squeeze(-1)
-        target = batch['rewards'] + self._settings.discount * batch['masks'] * next_v
-        losses = []
-        for critic in self._critics:
-            error = critic.forward(inputs) - target.unsqueeze(-1)
-            losses.append(error.square().mean())
-            if backward:
-                critic.backward(error.mul_(2 / len(error)))
-        return losses[0] + losses[1]
-
-    def _actor_loss(self, batch: TensorBatch, backward: bool) -> tuple[Tensor, dict[str, Tensor]]:
-        error, mean = self._cloning.error(batch)
-        bc = cloning_loss(error)
-        parts = {'bc': bc}
-        kind, alpha, size = self._settings.actor_loss, self._settings.alpha, len(error)
+    def _actor_loss(
+        self, batch: Arrays, backward: bool
+    ) -> tuple[np.float32, dict[str, np.float32]]:
+        states, actions = _join(batch['observations'], batch['actor_goals']), batch['actions']
+        mean = _outputs(self._actor, states)
+        error = mean - actions
+        constant = np.float32(error.shape[1] * HALF_LOG_TWO_PI)
+        nll = np.square(error).sum(-1, keepdims=True) * np.float32(0.5) + constant
+        parts = {'bc': nll.mean()}
+        kind, alpha, size = self._settings.actor_loss, np.float32(self._settings.alpha), len(error)
         if kind == 'bc':
-            loss = bc
-            gradient = error / size
-        else:
-            states = torch.cat([batch['observations'], batch['actor_goals']], dim=-1)
-        if kind == 'ddpgbc':
-            q, slope = self._smaller_q(states, mean.clamp(-1, 1), backward)
-            scale = q.abs().mean() + 1e-6
+            loss = parts['bc']
+        elif kind == 'ddpgbc':
+            q, slope = self._smaller_q(states, mean.clip(-1, 1), backward)
+            scale = np.abs(q).mean() + np.float32(1e-6)
             parts['q'] = -q.mean() / scale
-            loss = parts['q'] + alpha * bc
-            gradient = error.mul_(alpha / size)
-            gradient -= slope.mul_((mean.abs() <= 1) / (size * scale))
-        elif kind == 'awr':
-            advantage, _ = self._smaller_q(states, batch['actions'], False)
-            advantage -= self._value.forward(states)
-            weight = torch.exp(alpha * advantage).clamp_(max=100)
+            loss = parts['q'] + alpha * parts['bc']
+            error *= alpha
+            error -= slope * ((np.abs(mean) <= 1) / scale)
+        else:
+            advantage = self._smaller_q(states, actions, False)[0]
+            advantage -= _outputs(self._value, states)
+            with np.errstate(over='ignore'):
+                weight = np.minimum(np.exp(alpha * advantage), np.float32(100))
             parts['advantage'] = advantage.mean()
-            log_prob = -0.5 * error.square().sum(-1) - error.shape[1] * HALF_LOG_TWO_PI
-            loss = -(weight.squeeze(-1) * log_prob).mean()
-            gradient = error.mul_(weight).div_(size)
+            loss = (weight * nll).mean()
+            error *= weight
         if backward:
-            self._cloning.actor.backward(gradient)
+            _backward(self._actor, error / np.float32(size))
         return loss, parts | {'actor': loss}
 
-    def _smaller_q(self, states: Tensor, actions: Tensor, backward: bool) -> tuple[Tensor, Tensor]:
+    def _smaller_q(
+        self, states: np.ndarray, actions: np.ndarray, backward: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
         """The smaller critic (B, 1), and its gradient with respect to the actions (B, act_dim)."""
-        inputs = torch.cat([states, actions], dim=-1)
-        q1, q2 = (critic.forward(inputs) for critic in self._critics)
-        slope = torch.zeros_like(actions)
+        inputs = _join(states, actions)
+        q1, q2 = (_outputs(critic, inputs) for critic in self._critics)
+        slope = np.zeros_like(actions)
         if backward:
-            first = torch.where(q1 == q2, 0.5, (q1 < q2).float())  # as `torch.minimum` divides it
+            # As `torch.minimum` divides it where both are equal.
+            first = np.float32(0.5) * ((q1 <= q2).astype(np.float32) + (q1 < q2))
             for critic, share in zip(self._critics, (first, 1 - first), strict=True):
-                gradient = critic.backward(share, weights=False, inputs=True)
-                slope += gradient[:, states.shape[1] :]
-        return torch.minimum(q1, q2), slope
+                gradient = critic.backward(torch.from_numpy(share), weights=False, inputs=True)
+                slope += gradient.numpy()[:, states.shape[1] :]
+        return np.minimum(q1, q2), slope
+
+
+def _join(*parts: np.ndarray) -> np.ndarray:
+    return np.concatenate(parts, axis=-1)
+
+
+def _outputs(network: Passes, inputs: np.ndarray) -> np.ndarray:
+    """A new array (B, out_dim)."""
+    return network.forward(torch.from_numpy(inputs)).numpy()
+
+
+def _backward(network: Passes, gradient: np.ndarray) -> None:
+    network.backward(torch.from_numpy(gradient))

@@ -10,6 +10,7 @@ from metagcttt_core.agents.config import AgentSettings, GCBCSettings
 
 if TYPE_CHECKING:
     from metagcttt_core.agents.analytic import AnalyticLoss
+    from metagcttt_core.kernels import Kernels
 
 
 class GCBC(Agent):
@@ -30,11 +31,15 @@ class GCBC(Agent):
         return bc_loss, {'bc': bc_loss.detach(), 'mse': mse}
 
     def analytic_loss(
-        self, *, actor_only: bool = False, dtype: torch.dtype = torch.float32
+        self,
+        *,
+        actor_only: bool = False,
+        dtype: torch.dtype = torch.float32,
+        kernels: 'Kernels | None' = None,
     ) -> 'AnalyticLoss | None':
         """See `Agent.analytic_loss`; on a processor, with unit standard deviation."""
         from metagcttt_core.agents.analytic import Cloning
 
         if not self._has_analytic_loss_of(GCBC):
             return None
-        return Cloning(self, dtype)
+        return Cloning(self, dtype, kernels)

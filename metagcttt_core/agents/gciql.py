@@ -14,6 +14,7 @@ from metagcttt_core.agents.state_value import StateValue
 
 if TYPE_CHECKING:
     from metagcttt_core.agents.analytic import AnalyticLoss
+    from metagcttt_core.kernels import Kernels
 
 
 class GCIQL(Agent):
@@ -108,21 +109,25 @@ class GCIQL(Agent):
         return torch.minimum(*qs).squeeze(-1)
 
     def analytic_loss(
-        self, *, actor_only: bool = False, dtype: torch.dtype = torch.float32
+        self,
+        *,
+        actor_only: bool = False,
+        dtype: torch.dtype = torch.float32,
+        kernels: 'Kernels | None' = None,
     ) -> 'AnalyticLoss | None':
         """See `Agent.analytic_loss`; on a processor, with unit standard deviation."""
         from metagcttt_core.agents.analytic_gciql import AnalyticGCIQL
 
         if not self._has_analytic_loss_of(GCIQL):
             return None
-        return AnalyticGCIQL(self, dtype, actor_only=actor_only)
+        return AnalyticGCIQL(self, dtype, kernels, actor_only=actor_only)
 
     @torch.no_grad()
     def update_targets(self) -> None:
         """Move the target critics by tau towards the critics."""
-        for target, critic in ((self.target1, self.critic1), (self.target2, self.critic2)):
-            for trailing, weight in zip(target.parameters(), critic.parameters(), strict=True):
-                trailing.lerp_(weight, self.settings.tau)
+        targets: list[Tensor] = [*self.target1.parameters(), *self.target2.parameters()]
+        critics: list[Tensor] = [*self.critic1.parameters(), *self.critic2.parameters()]
+        torch._foreach_lerp_(targets, critics, self.settings.tau)
 
     def state_value(self, observations: Tensor, goals: Tensor) -> Tensor:
         """V(s, g) of observations and goals (B, obs_dim), (B,)."""

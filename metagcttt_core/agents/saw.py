@@ -74,7 +74,11 @@ class SAW(Agent):
         """The source of batches, with waypoints."""
         settings = self.settings
         return GoalRelabeller(
-            dataset, settings.goals, settings.discount, subgoal_steps=settings.subgoal_steps
+            dataset,
+            settings.goals,
+            settings.discount,
+            subgoal_steps=settings.subgoal_steps,
+            scaling=self.scaling,
         )
 
     def losses(

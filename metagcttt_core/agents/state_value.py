@@ -8,9 +8,13 @@ import numpy as np
 import torch
 from torch import nn, Tensor
 
+from metagcttt_core.data.scaling import Scaling
+
 
 class ValueAgent(Protocol):
     """An agent that has a value function."""
+
+    scaling: Scaling
 
     @property
     def device(self) -> torch.device:
@@ -45,6 +49,7 @@ class StateValue:
     def __call__(self, observations: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """V(observations (n, obs_dim) | goal (obs_dim,)), (n,) float32."""
         device = self.agent.device
-        states = torch.from_numpy(np.asarray(observations, np.float32)).to(device)
-        goals = torch.from_numpy(np.asarray(goal, np.float32)).to(device).expand_as(states)
+        scaled = self.agent.scaling.observations
+        states = torch.from_numpy(scaled(observations)).to(device)
+        goals = torch.from_numpy(scaled(goal)).to(device).expand_as(states)
         return self.agent.state_value(states, goals).cpu().numpy()

@@ -3,6 +3,7 @@
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.data.errors import DatasetError
 from metagcttt_core.data.relabel import Batch, GoalConfig, GoalDistribution, GoalRelabeller
+from metagcttt_core.data.scaling import Scaling
 
 __all__ = [
     'Batch',
@@ -10,5 +11,6 @@ __all__ = [
     'GoalConfig',
     'GoalDistribution',
     'GoalRelabeller',
+    'Scaling',
     'TrajectoryDataset',
 ]

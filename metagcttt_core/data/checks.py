@@ -48,6 +48,30 @@ def matrix(values: np.ndarray, name: str, where: str) -> np.ndarray:
     return narrowed
 
 
+def centred(values: np.ndarray, name: str, where: str) -> tuple[np.ndarray, np.ndarray]:
+    """`values` as float32 counted from an origin, and the origin (dimensions,) float64.
+
+    The origin is the middle of the range, in whole units, where the numbers are so far from zero
+    that float32 would round their changes away; elsewhere it is zero.
+
+    Raises:
+        DatasetError: As `matrix`.
+    """
+    array = np.asanyarray(values)
+    if array.dtype != np.float64 or array.ndim != 2 or len(array) < 2:
+        plain = matrix(array, name, where)
+        return plain, np.zeros(plain.shape[1])
+    finite(array, name, where)
+    origin = np.zeros(array.shape[1])
+    with np.errstate(over='ignore', invalid='ignore'):
+        dims = [dim for dim, _, _ in _lost_precision(array, array.astype(np.float32))]
+    for dim in dims:
+        column = array[:, dim]
+        origin[dim] = np.rint(column.min() / 2 + column.max() / 2)
+        _log.info('%s: %s[:, %d] is counted from %.0f', where, name, dim, origin[dim])
+    return matrix(array - origin if dims else array, name, where), origin
+
+
 def flags(values: np.ndarray, name: str, where: str) -> np.ndarray:
     """`values` as booleans of shape (rows,).
 
@@ -149,7 +173,7 @@ def warn_of_oddities(
     largest = max(float(np.abs(part).max()) for _, part in _chunks(actions))
     if largest > 1 + 1e-4:
         _log.warning(
-            '%s: actions reach %.3g, beyond the range of a policy, which is -1 to 1: scale them',
+            '%s: actions reach %.3g, beyond -1 to 1: pre-training scales them by the largest',
             where,
             largest,
         )
@@ -175,21 +199,27 @@ def warn_of_oddities(
 def _warn_of_lost_precision(
     exact: np.ndarray, narrowed: np.ndarray, name: str, where: str
 ) -> None:
-    """Log numbers so far from zero that float32 rounds their changes away, such as UTM metres."""
-    if exact.dtype != np.float64 or len(exact) < 2:
-        return
-    part = slice(0, _CHUNK_ROWS)
-    lost = np.abs(exact[part] - narrowed[part]).max(axis=0)
-    steps = np.median(np.abs(np.diff(exact[part], axis=0)), axis=0)
-    for dim in np.flatnonzero((lost > 0.05 * steps) & (steps > 0)):
+    """Log numbers so far from zero that float32 rounds their changes away."""
+    for dim, lost, step in _lost_precision(exact, narrowed):
         _log.warning(
             '%s: %s[:, %d] loses %.2g in float32, where a step is %.2g: subtract an origin',
             where,
             name,
             dim,
-            lost[dim],
-            steps[dim],
+            lost,
+            step,
         )
+
+
+def _lost_precision(exact: np.ndarray, narrowed: np.ndarray) -> list[tuple[int, float, float]]:
+    """The dimensions that lose more than a twentieth of a step, with loss and median step."""
+    if exact.dtype != np.float64 or len(exact) < 2:
+        return []
+    part = slice(0, _CHUNK_ROWS)
+    lost = np.abs(exact[part] - narrowed[part]).max(axis=0)
+    steps = np.median(np.abs(np.diff(exact[part], axis=0)), axis=0)
+    dims = np.flatnonzero((lost > 0.05 * steps) & (steps > 0) & np.isfinite(lost))
+    return [(int(dim), float(lost[dim]), float(steps[dim])) for dim in dims]
 
 
 def _chunks(array: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:

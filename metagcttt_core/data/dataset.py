@@ -3,8 +3,9 @@
 from collections.abc import Mapping
 from functools import cached_property
 import hashlib
+import json
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from metagcttt_core.data import checks, minari, npz
 from metagcttt_core.data.errors import DatasetError
 
 _CHUNK_ROWS = 1 << 20
+_CONTRACT = 'contract'
+"""Name of the text in an npz file that holds the contract as JSON."""
 
 
 class TrajectoryDataset:
@@ -28,13 +31,16 @@ class TrajectoryDataset:
         episode_ends                  3              6      (inclusive)
 
     Attributes:
-        observations: (N, obs_dim) float32.
+        observations: (N, obs_dim) float32, counted from `origin`; `states` adds it.
         actions: (N, act_dim) float32.
         terminals: (N,) bool, true on the last row of each trajectory.
         extras: Further per-row arrays of the file, such as `qpos` and `qvel`, by name.
         episode_starts: (E,) int64, the first row of each trajectory.
         episode_ends: (E,) int64, the last row of each trajectory (inclusive).
         source: The file it was read from, if any.
+        origin: (obs_dim,) float64; zeros but for values such as UTM coordinates, which are so
+            large that float32 would round their changes away.
+        contract: The robot's contract that the rows satisfy (`Contract.identity`), if any.
     """
 
     def __init__(
@@ -44,6 +50,9 @@ class TrajectoryDataset:
         terminals: np.ndarray,
         extras: Mapping[str, np.ndarray] | None = None,
         source: Path | None = None,
+        *,
+        origin: np.ndarray | None = None,
+        contract: Mapping[str, Any] | None = None,
     ) -> None:
         """Wrap validated arrays; `from_arrays` and `load` validate them."""
         self.observations = observations
@@ -51,6 +60,8 @@ class TrajectoryDataset:
         self.terminals = terminals
         self.extras = dict(extras or {})
         self.source = source
+        self.origin = np.zeros(observations.shape[1]) if origin is None else origin
+        self.contract = dict(contract) if contract else None
         self.episode_ends = np.flatnonzero(terminals).astype(np.int64)
         self.episode_starts = np.concatenate([[0], self.episode_ends[:-1] + 1]).astype(np.int64)
         lengths = np.diff(self.episode_ends, prepend=-1)
@@ -68,22 +79,25 @@ class TrajectoryDataset:
         extras: Mapping[str, np.ndarray] | None = None,
         *,
         source: Path | None = None,
+        contract: Mapping[str, Any] | None = None,
     ) -> Self:
         """A dataset of the given rows, each of them validated.
 
         Args:
-            observations: (N, obs_dim) real numbers; kept as they are when float32, else converted.
+            observations: (N, obs_dim) real numbers; kept as they are when float32, else converted,
+                large coordinates after an origin was subtracted.
             actions: (N, act_dim) real numbers.
             terminals: (N,) of booleans or zeros and ones, true on the last row of each trajectory.
             extras: Further arrays with N rows, kept with the dataset.
             source: The file to name in errors.
+            contract: See the attribute.
 
         Raises:
             DatasetError: For a wrong rank, length or type, a non-finite value (with its row), or a
                 last row that is not terminal.
         """
         where = str(source) if source else 'dataset'
-        observations = checks.matrix(observations, 'observations', where)
+        observations, origin = checks.centred(observations, 'observations', where)
         actions = checks.matrix(actions, 'actions', where)
         terminals = checks.flags(terminals, 'terminals', where)
         extras = {name: np.asanyarray(array) for name, array in (extras or {}).items()}
@@ -106,7 +120,9 @@ class TrajectoryDataset:
         for name, array in {'observations': observations, 'actions': actions, **extras}.items():
             checks.finite(array, name, where)
         checks.warn_of_oddities(observations, actions, terminals, where)
-        return cls(observations, actions, terminals, extras, source)
+        return cls(
+            observations, actions, terminals, extras, source, origin=origin, contract=contract
+        )
 
     @classmethod
     def load(cls, path: str | Path, *, memory_map: bool | None = None) -> Self:
@@ -137,22 +153,41 @@ class TrajectoryDataset:
         ends = checks.take_ends(arrays, str(path))
         observations, actions = arrays.pop('observations'), arrays.pop('actions')
         following = arrays.pop('next_observations', None)
-        dataset = cls.from_arrays(observations, actions, ends, arrays, source=path)
+        contract = None if minari.is_minari(path) else npz.read_json(path, _CONTRACT)
+        dataset = cls.from_arrays(
+            observations, actions, ends, arrays, source=path, contract=contract
+        )
         if following is not None:
+            following = following - dataset.origin if dataset.origin.any() else following
             checks.following_rows(dataset.observations, following, ends, str(path))
         return dataset
 
     def save(self, path: str | Path) -> None:
         """Write the dataset as OGBench's compressed npz, atomically; the inverse of `load`."""
+        about = {_CONTRACT: np.array(json.dumps(self.contract))} if self.contract else {}
         npz.write_arrays(
             Path(path),
             {
-                'observations': self.observations,
+                **about,
+                'observations': self.states(slice(None)),
                 'actions': self.actions,
                 'terminals': self.terminals,
                 **self.extras,
             },
         )
+
+    def states(self, rows: int | slice | np.ndarray) -> np.ndarray:
+        """The observations of rows as a robot gives them: float32, or float64 with an origin."""
+        return (
+            self.observations[rows] + self.origin if self.origin.any() else self.observations[rows]
+        )
+
+    @cached_property
+    def action_reach(self) -> np.ndarray:
+        """The largest absolute value of each dimension of an action, (act_dim,) float64."""
+        starts = range(0, self.num_rows, _CHUNK_ROWS)
+        parts = [np.abs(self.actions[start : start + _CHUNK_ROWS]).max(axis=0) for start in starts]
+        return np.max(parts, axis=0).astype(np.float64)
 
     @property
     def num_rows(self) -> int:
@@ -187,6 +222,8 @@ class TrajectoryDataset:
             digest.update(f'{array.dtype.str}{array.shape}'.encode())
             for start in range(0, len(array), _CHUNK_ROWS):
                 digest.update(np.ascontiguousarray(array[start : start + _CHUNK_ROWS]).data)
+        if self.origin.any():
+            digest.update(self.origin.data)
         return digest.hexdigest()
 
     def episode_of(self, rows: np.ndarray) -> np.ndarray:

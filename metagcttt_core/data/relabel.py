@@ -7,6 +7,7 @@ from pydantic import Field, model_validator
 
 from metagcttt_core.config.settings import Settings
 from metagcttt_core.data.dataset import TrajectoryDataset
+from metagcttt_core.data.scaling import Scaling
 
 Batch = dict[str, np.ndarray]
 
@@ -57,6 +58,7 @@ class GoalRelabeller:
         discount: float = 0.99,
         *,
         subgoal_steps: int | None = None,
+        scaling: Scaling | None = None,
     ) -> None:
         """Draw from `dataset` by the distributions of `config`.
 
@@ -65,11 +67,13 @@ class GoalRelabeller:
             config: Distributions of the goals.
             discount: Shapes geometric goals: P(k) = (1 - discount) discount^(k-1).
             subgoal_steps: Steps to the waypoints in the batches; none by default.
+            scaling: From the dataset's units to those of the batches; none by default.
         """
         self.dataset = dataset
         self.config = config
         self.discount = discount
         self.subgoal_steps = subgoal_steps
+        self.scaling = scaling or Scaling.identity(dataset.obs_dim, dataset.act_dim)
 
     def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:
         """A batch of uniformly drawn transitions, relabelled; see `relabel` for its keys."""
@@ -114,27 +118,35 @@ class GoalRelabeller:
             value_rows: (..., B) rows of the value goals, if there are such.
         """
         data = self.dataset
-        batch = {'observations': data.observations[rows], 'actions': data.actions[rows]}
+        batch = {
+            'observations': self._seen(rows),
+            'actions': self.scaling.actions(data.actions[rows]),
+        }
         if value_rows is not None:
             success = (value_rows == rows).astype(np.float32)
-            batch['next_observations'] = data.observations[rows + 1]
-            batch['value_goals'] = data.observations[value_rows]
+            batch['next_observations'] = self._seen(rows + 1)
+            batch['value_goals'] = self._seen(value_rows)
             batch['rewards'] = success - np.float32(self.config.gc_negative)
             batch['masks'] = 1 - success
-        batch['actor_goals'] = data.observations[actor_rows]
+        batch['actor_goals'] = self._seen(actor_rows)
         if self.subgoal_steps is not None:
             final = data.episode_ends[data.episode_of(rows)] - 1  # as in `goal_rows`
             subgoals = np.minimum(rows + self.subgoal_steps, final)
             ahead = (rows <= actor_rows) & (actor_rows <= final)
             waypoints = np.where(ahead, np.minimum(subgoals, actor_rows), subgoals)
-            batch['subgoals'] = data.observations[subgoals]
-            batch['waypoints'] = data.observations[waypoints]
+            batch['subgoals'] = self._seen(subgoals)
+            batch['waypoints'] = self._seen(waypoints)
         return batch
+
+    def _seen(self, rows: np.ndarray) -> np.ndarray:
+        """Observations as networks see them."""
+        return self.scaling.observations(self.dataset.observations[rows], self.dataset.origin)
 
     @staticmethod
     def fix_actor_goals(batch: Batch, fixed: np.ndarray, goal: np.ndarray) -> None:
         """Set the actor goals of the transitions where `fixed` (..., B) to `goal` (obs_dim,).
 
+        The goal is in the units of the batch.
         Its way is not in the dataset, so their waypoints are the subgoals.
         """
         batch['actor_goals'][fixed] = goal

@@ -53,7 +53,7 @@ class TaskSampler:
         """
         dataset: TrajectoryDataset = self._filter.dataset
         for redraws in range(_MAX_REDRAWS):
-            state, goal = dataset.observations[rng.integers(dataset.num_rows, size=2)]
+            state, goal = dataset.states(rng.integers(dataset.num_rows, size=2))
             support = self._filter.query(state, goal, value_fn)
             support = support.without_rows(dataset.terminals)
             train, test = support.split(self._test_fraction, self._max_test, rng)

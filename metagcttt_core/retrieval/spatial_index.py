@@ -1,8 +1,11 @@
 """Spatial index of dataset rows: a sorted grid over one or two coordinates."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+
+from metagcttt_core.kernels import kernels_if_any
 
 _MOST_CELLS = 2**30
 
@@ -14,6 +17,25 @@ class Neighbours(NamedTuple):
     distances: np.ndarray
 
 
+@dataclass(frozen=True)
+class Ball:
+    """The rows within a radius of a point; see `SpatialIndex`."""
+
+    index: 'SpatialIndex'
+    point: np.ndarray
+    radius: float
+
+    def __call__(self, *, strict: bool = False) -> Neighbours:
+        """All of them."""
+        return self.index.ball(self.point, self.radius, strict=strict)
+
+    def nearest_per_episode(
+        self, first_usable: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Of each trajectory the one nearest to the point."""
+        return self.index.nearest_per_episode(self.point, self.radius, first_usable)
+
+
 _NOTHING = Neighbours(np.empty(0, np.int64), np.empty(0))
 
 
@@ -22,7 +44,7 @@ class SpatialIndex:
 
     Rows are sorted by the cell of their first two position coordinates. A query reads the cells
     that overlap the ball and then checks the exact Euclidean distance, in float64, over all
-    position coordinates. Costs 12 to 16 bytes a row.
+    position coordinates. Costs 16 to 20 bytes a row.
     """
 
     def __init__(
@@ -31,8 +53,17 @@ class SpatialIndex:
         position_dims: tuple[int, ...],
         scale: tuple[float, ...] | None,
         cell_size: float,
+        episodes: np.ndarray | None = None,
     ) -> None:
-        """Sort the rows of `observations` (N, obs_dim) into cells of `cell_size` (scaled)."""
+        """Sort rows into cells.
+
+        Args:
+            observations: (N, obs_dim).
+            position_dims: The coordinates that distances use.
+            scale: Factor of each of them; 1 by default.
+            cell_size: Edge of the cells, in scaled units.
+            episodes: (N,) the trajectory of each row, ascending, for `nearest_per_episode`.
+        """
         self._observations = observations
         self._dims = list(position_dims)
         self._scale = np.ones(len(self._dims)) if scale is None else np.asarray(scale, np.float64)
@@ -49,6 +80,9 @@ class SpatialIndex:
         order = np.argsort(keys, kind='stable')
         self._order = order.astype(np.int32 if len(order) < 2**31 else np.int64)
         self._columns = [column[order] for column in columns]
+        self._episodes = None if episodes is None else episodes[order].astype(np.int32)
+        self._num_episodes = 0 if episodes is None else int(episodes[-1]) + 1
+        self._kernels = kernels_if_any()
         self._keys, starts = np.unique(keys[order], return_index=True)
         self._starts = np.append(starts, len(order))
         # Columns of cells that hold any row: a wide ball over a fine grid passes many that do not.
@@ -58,7 +92,8 @@ class SpatialIndex:
     def num_bytes(self) -> int:
         """Memory that the index holds."""
         arrays = (self._order, self._keys, self._starts, self._occupied, *self._columns)
-        return sum(array.nbytes for array in arrays)
+        episodes = 0 if self._episodes is None else self._episodes.nbytes
+        return sum(array.nbytes for array in arrays) + episodes
 
     def ball(self, point: np.ndarray, radius: float, *, strict: bool = False) -> Neighbours:
         """Rows whose distance to `point` is at most `radius` (below it when `strict`).
@@ -84,6 +119,43 @@ class SpatialIndex:
             distances = self._distances(list(positions.T), point)
         near = np.flatnonzero(distances < radius if strict else distances <= radius)
         return Neighbours(rows[near].astype(np.int64), distances[near])
+
+    def nearest_per_episode(
+        self, point: np.ndarray, radius: float, first_usable: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Of each trajectory the row nearest to `point`, the first on ties, within `radius`.
+
+        Args:
+            point: (position dims,) in the units of the observations.
+            radius: In scaled units.
+            first_usable: (trajectories,) int64, the first row of each that counts; all by default.
+
+        Returns:
+            Trajectories, ascending, with rows and distances, (n,) each; the same, in one reading
+            of the ball, as from `ball`. None without kernels, or for more than two coordinates.
+        """
+        kernels, order, episodes = self._kernels, self._order, self._episodes
+        if kernels is None or episodes is None or len(self._dims) > 2 or order.itemsize > 4:
+            return None
+        point = np.asarray(point, np.float64)
+        parts = self._parts(point, radius)
+        starts = np.array([part.start for part in parts], np.int64)
+        stops = np.array([part.stop for part in parts], np.int64)
+        columns = np.array([column.ctypes.data for column in self._columns], np.uint64)
+        distances = np.full(self._num_episodes, np.inf)
+        rows = np.zeros(self._num_episodes, np.int64)
+        kernels.nearest_per_episode(
+            len(parts),
+            *(array.ctypes.data for array in (starts, stops, columns)),
+            len(columns),
+            *(array.ctypes.data for array in (point, self._scale)),
+            radius,
+            *(array.ctypes.data for array in (order, episodes)),
+            None if first_usable is None else first_usable.ctypes.data,
+            *(array.ctypes.data for array in (distances, rows)),
+        )
+        found = np.flatnonzero(distances < np.inf)
+        return found, rows[found], distances[found]
 
     def nearest(self, point: np.ndarray) -> int:
         """The row nearest to `point`, the first on ties."""

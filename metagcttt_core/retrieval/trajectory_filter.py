@@ -9,10 +9,10 @@ import numpy as np
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.retrieval.config import FilterConfig
 from metagcttt_core.retrieval.registry import VARIANTS
-from metagcttt_core.retrieval.spatial_index import SpatialIndex
+from metagcttt_core.retrieval.spatial_index import Ball, SpatialIndex
 from metagcttt_core.retrieval.support import SupportSet
 from metagcttt_core.retrieval.value_cache import ValueCache, ValueFunction
-from metagcttt_core.retrieval.variants import Task
+from metagcttt_core.retrieval.variants import ranges, Task
 
 __all__ = ['TrajectoryFilter', 'ValueFunction']
 
@@ -46,7 +46,9 @@ class TrajectoryFilter:
                 f'observation, which is {dataset.obs_dim} in this dataset'
             )
         dims, scale = self.config.position_dims, self.config.scale
-        self._index = SpatialIndex(dataset.observations, dims, scale, self.config.cell_size)
+        episodes = dataset.episode_of(np.arange(dataset.num_rows))
+        cell_size = self.config.cell_size
+        self._index = SpatialIndex(dataset.observations, dims, scale, cell_size, episodes)
         self._value_cache = ValueCache(dataset)
 
     @property
@@ -75,23 +77,20 @@ class TrajectoryFilter:
         began = time.perf_counter()
         state = self._checked('state', state)
         goal = self._checked('goal', goal)
+        place, target = state - self.dataset.origin, goal - self.dataset.origin
         dims, epsilon = list(self.config.position_dims), self.config.epsilon
         task = Task(
             dataset=self.dataset,
-            near_state=partial(self._index.ball, state[dims], epsilon),
-            near_goal=partial(self._index.ball, goal[dims], epsilon),
-            value=None
-            if value_fn is None
-            else partial(self._value_cache.values, value_fn, goal.astype(np.float32)),
+            near_state=Ball(self._index, place[dims], epsilon),
+            near_goal=Ball(self._index, target[dims], epsilon),
+            value=None if value_fn is None else partial(self._value_cache.values, value_fn, goal),
         )
         found = VARIANTS[self.config.variant](task, self.config)
-        starts, stops = found.starts[found.keep], found.stops[found.keep]
-        segments = [(int(a), int(max(a, b))) for a, b in zip(starts, stops, strict=True)]
+        starts = found.starts[found.keep]
+        stops = np.maximum(starts, found.stops[found.keep])
         return SupportSet(
-            indices=np.concatenate(
-                [np.empty(0, np.int64), *(np.arange(a, b) for a, b in segments)]
-            ),
-            segments=segments,
+            indices=ranges(starts, stops),
+            segments=list(zip(starts.tolist(), stops.tolist(), strict=True)),
             episodes=found.episodes[found.keep],
             scores=found.scores[found.keep].astype(np.float64),
             num_relevant=found.num_relevant,
@@ -137,7 +136,8 @@ class TrajectoryFilter:
             raise ValueError(
                 f'position must be {len(self.config.position_dims)} finite numbers, got {position}'
             )
-        return self._index.nearest(position)
+        dims = list(self.config.position_dims)
+        return self._index.nearest(position - self.dataset.origin[dims])
 
     def _checked(self, name: str, values: np.ndarray) -> np.ndarray:
         array = np.asarray(values, dtype=np.float64)

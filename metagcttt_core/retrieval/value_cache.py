@@ -31,12 +31,13 @@ class ValueCache:
 
         Args:
             value_fn: (observations (n, obs_dim), goal (obs_dim,)) -> (n,).
-            goal: (obs_dim,) float32.
+            goal: (obs_dim,).
             rows: (n,) rows of the dataset.
 
         Raises:
             ValueError: If `value_fn` returns another shape or a non-finite value.
         """
+        goal = self._in_precision(goal)
         known = self._known(value_fn, goal)
         values = known[rows]
         unknown = rows[np.isnan(values)]
@@ -57,7 +58,7 @@ class ValueCache:
         Returns:
             True if it finished.
         """
-        goal = np.asarray(goal, np.float32)
+        goal = self._in_precision(goal)
         known = self._known(value_fn, goal)
         unknown = np.flatnonzero(np.isnan(known))
         for start in range(0, len(unknown), _BATCH_ROWS):
@@ -65,6 +66,10 @@ class ValueCache:
                 return False
             self._evaluate(value_fn, goal, known, unknown[start : start + _BATCH_ROWS])
         return True
+
+    def _in_precision(self, goal: np.ndarray) -> np.ndarray:
+        """The goal in float32, as observations are, unless these have an origin."""
+        return np.asarray(goal, np.float64 if self._dataset.origin.any() else np.float32)
 
     def _known(self, value_fn: ValueFunction, goal: np.ndarray) -> np.ndarray:
         """The cached values of a pair, NaN where unknown; the oldest pair is evicted."""
@@ -80,7 +85,7 @@ class ValueCache:
     def _evaluate(
         self, value_fn: ValueFunction, goal: np.ndarray, known: np.ndarray, rows: np.ndarray
     ) -> None:
-        result = np.asarray(value_fn(self._dataset.observations[rows], goal), np.float32)
+        result = np.asarray(value_fn(self._dataset.states(rows), goal), np.float32)
         if result.shape != rows.shape:
             raise ValueError(f'value_fn must return shape {rows.shape}, got {result.shape}')
         if not np.isfinite(result).all():

@@ -17,10 +17,9 @@ import numpy as np
 
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.retrieval.config import FilterConfig
-from metagcttt_core.retrieval.spatial_index import Neighbours
+from metagcttt_core.retrieval.spatial_index import Ball
 
 RowValues = Callable[[np.ndarray], np.ndarray]
-Ball = Callable[..., Neighbours]
 
 # The published GC-TTT code turns V into a step distance with this discount, whatever the agent's.
 _GCTTT_DISCOUNT = 0.99
@@ -70,8 +69,7 @@ class PerEpisode(NamedTuple):
 
 def paper(task: Task, config: FilterConfig) -> Candidates:
     """Appendix A: relevant by equation 10, scored by equation 11 or 12, the top p percent kept."""
-    near = task.near_state()
-    start = smallest_per_episode(task.dataset.episode_of(near.rows), *near)
+    start = _nearest(task, task.near_state)
     if task.value is None:
         end = _closest_to_goal(task, start.episodes, start.rows)
     else:
@@ -110,8 +108,7 @@ def random(task: Task, config: FilterConfig) -> Candidates:
 
 def relevance_only(task: Task, config: FilterConfig) -> Candidates:
     """Ablation: random relevant trajectories, from the state nearest to s to their end."""
-    near = task.near_state()
-    start = smallest_per_episode(task.dataset.episode_of(near.rows), *near)
+    start = _nearest(task, task.near_state)
     scores = np.random.default_rng(config.seed).random(len(start.episodes))
     return Candidates(
         num_relevant=len(start.episodes),
@@ -166,18 +163,28 @@ def _stops_after(task: Task, end: PerEpisode) -> np.ndarray:
 
 def _closest_to_goal(task: Task, episodes: np.ndarray, starts: np.ndarray) -> PerEpisode:
     """Per trajectory the state closest to g from its start on, where that is within epsilon."""
-    near = task.near_goal()
     data = task.dataset
     first_usable = np.full(data.num_episodes, data.num_rows)
     first_usable[episodes] = starts
-    near_episodes = data.episode_of(near.rows)
-    usable = np.flatnonzero(near.rows >= first_usable[near_episodes])
-    return smallest_per_episode(near_episodes[usable], near.rows[usable], near.distances[usable])
+    return _nearest(task, task.near_goal, first_usable)
+
+
+def _nearest(task: Task, ball: Ball, first_usable: np.ndarray | None = None) -> PerEpisode:
+    """Per trajectory the state closest to the ball's point, from its first usable row on."""
+    found = ball.nearest_per_episode(first_usable)
+    if found is not None:
+        return PerEpisode(*found)
+    rows, distances = ball()
+    episodes = task.dataset.episode_of(rows)
+    if first_usable is not None:
+        usable = np.flatnonzero(rows >= first_usable[episodes])
+        episodes, rows, distances = episodes[usable], rows[usable], distances[usable]
+    return smallest_per_episode(episodes, rows, distances)
 
 
 def _highest_value(task: Task, episodes: np.ndarray, starts: np.ndarray) -> PerEpisode:
     """Per trajectory the state of highest V from its start on, as the smallest of -V."""
-    rows = _ranges(starts, task.dataset.episode_ends[episodes] + 1)
+    rows = ranges(starts, task.dataset.episode_ends[episodes] + 1)
     return smallest_per_episode(task.dataset.episode_of(rows), rows, -_values(task, rows))
 
 
@@ -236,7 +243,7 @@ def _gcttt_by_value(task: Task, config: FilterConfig) -> Candidates:
     relevant, firsts = near_episodes[first_slots], near_s[first_slots]
     eligible = firsts + config.min_steps <= data.episode_ends[relevant]
     episodes, firsts = relevant[eligible], firsts[eligible]
-    rows = _ranges(firsts + config.min_steps, data.episode_ends[episodes] + 1)
+    rows = ranges(firsts + config.min_steps, data.episode_ends[episodes] + 1)
     inside = 1 + (1 - _GCTTT_DISCOUNT) * _values(task, rows).astype(np.float64)
     steps = np.log(np.where(inside > 0, inside, 1)) / np.log(_GCTTT_DISCOUNT)
     distances = np.where(inside > 0, steps, np.finfo(np.float64).max)  # V below -100: far away
@@ -247,7 +254,7 @@ def _gcttt_by_value(task: Task, config: FilterConfig) -> Candidates:
     return Candidates(len(relevant), episodes, firsts, best.rows, -best.values, keep)
 
 
-def _ranges(starts: np.ndarray, stops: np.ndarray) -> np.ndarray:
+def ranges(starts: np.ndarray, stops: np.ndarray) -> np.ndarray:
     """The rows of all [start, stop), in order."""
     counts = stops - starts
     if not len(counts):

@@ -2,7 +2,15 @@
 
 from metagcttt_core.robot.contract import Contract
 from metagcttt_core.robot.errors import ContractError, MessageError
+from metagcttt_core.robot.identity import identity_fault
 from metagcttt_core.robot.observer import Observer
 from metagcttt_core.robot.yaml_file import load_contract
 
-__all__ = ['Contract', 'ContractError', 'MessageError', 'Observer', 'load_contract']
+__all__ = [
+    'Contract',
+    'ContractError',
+    'MessageError',
+    'Observer',
+    'identity_fault',
+    'load_contract',
+]

@@ -97,14 +97,17 @@ class Commander:
     def fall_back(self, reaction: str, now_ns: int) -> NDArray[np.float64] | None:
         """The command instead of the policy's; none where nothing is to be sent.
 
-        Zeros are sent at once: the limits on changes are for motion, not for stops.
+        Zeros are sent at once unless the contract limits the changes of stops too.
         """
         if reaction == 'nothing' or (reaction == 'hold' and self._last is None):
             return None
         if reaction == 'hold':
             assert self._last is not None
             return self._sent(self._last, now_ns)
-        return self._sent(np.zeros_like(self._limits.low), now_ns)
+        zeros = np.zeros_like(self._limits.low)
+        if self._topic.stops_within_rates and self._last is not None:
+            zeros = self._limits.approach(zeros, self._last, (now_ns - self._last_ns) / 1e9)
+        return self._sent(zeros, now_ns)
 
     def _start(self, observation: NDArray[np.float64]) -> NDArray[np.float64]:
         parts = [

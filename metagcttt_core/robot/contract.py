@@ -3,7 +3,9 @@
 from collections import Counter
 from collections.abc import Iterable
 from functools import cached_property
+import hashlib
 from itertools import chain
+import json
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
@@ -53,7 +55,10 @@ class Numbers(Settings):
         "by the message's own `name` where it has one",
     )
     size: int | None = Field(
-        None, ge=1, description='length of a field that is an array without names of joints'
+        None,
+        ge=1,
+        le=10000,
+        description='length of a field that is an array without names of joints',
     )
 
     @model_validator(mode='after')
@@ -74,8 +79,18 @@ class ObservedValue(Numbers):
     """Numbers of a message that are part of the observation."""
 
     name: str = Field('', description='name in the observation; empty: the path of the field')
-    transform: Literal['none', 'heading'] = Field(
-        'none', description='heading: cosine and sine of the yaw of a quaternion, two values'
+    transform: Literal['none', 'heading', 'angle', 'wrap'] = Field(
+        'none',
+        description='heading: cosine and sine of the yaw of a quaternion, two values; angle: '
+        'those of an angle in radians; wrap: an angle brought to -pi to pi',
+    )
+    scale: float = Field(
+        1.0,
+        description='factor, applied after `origin` and before `transform`; 0.0174533 makes '
+        'radians of degrees',
+    )
+    clamp: tuple[float, float] | None = Field(
+        None, description='lowest and highest value; what lies beyond is observed as the bound'
     )
     origin: float = Field(
         0.0,
@@ -90,17 +105,26 @@ class ObservedValue(Numbers):
 
     @model_validator(mode='after')
     def _check_transform(self) -> Self:
-        if self.transform == 'heading' and (self.joints or self.size):
-            raise ValueError('a heading has no joints and no size')
+        if self.is_pair and (self.joints or self.size):
+            raise ValueError(f'transform {self.transform} takes no joints and no size')
         if self.origin and (self.joints or self.transform == 'heading'):
             raise ValueError('headings and joints have no origin')
+        if not self.scale or (self.transform == 'heading' and self.scale != 1):
+            raise ValueError('scale must not be 0, and a heading has none')
+        if self.clamp and (self.clamp[0] >= self.clamp[1] or self.transform != 'none'):
+            raise ValueError('clamp takes a lower and a higher bound, and no transform')
         return self
+
+    @property
+    def is_pair(self) -> bool:
+        """True for an angle that is observed as its cosine and sine."""
+        return self.transform in ('heading', 'angle')
 
     @property
     def columns(self) -> list[str]:
         """The names of the values in the observation."""
         name = self.name or self.field
-        if self.transform == 'heading':
+        if self.is_pair:
             return [f'{name}.cos', f'{name}.sin']
         if self.joints:
             return [f'{joint}.{name}' for joint in self.joints]
@@ -118,6 +142,12 @@ class ObservedTopic(Settings):
     )
     frame_id: str | None = Field(
         None, description='frame that the header has to name; absent: any'
+    )
+    align: Literal['asof', 'hold', 'drop'] = Field(
+        'asof',
+        description='which message an observation takes: asof, the newest unless it is older than '
+        'timeout_s; hold, the newest however old, for what is sent only when it changes; drop, '
+        'the newest unless it is older than a control period',
     )
     timeout_s: float = Field(
         0.5, gt=0, le=3600, description='age from which the newest message is late, seconds'
@@ -198,6 +228,12 @@ class CommandTopic(Settings):
     fallback: Annotated[
         Fallback, BeforeValidator(_same_for_all, json_schema_input_type=Fallback | Reaction)
     ] = Field(description='what is sent without a command of the policy; one word for every case')
+    stops_within_rates: bool = Field(
+        False, description='whether max_rate holds for zeros too; else a stop is sent at once'
+    )
+    zero_is_a_safe_position: bool = Field(
+        False, description='says that zeros are meant although positions are commanded'
+    )
 
     @model_validator(mode='after')
     def _check_zeros(self) -> Self:
@@ -209,7 +245,60 @@ class CommandTopic(Settings):
                     f'fallback {used[0]}: zeros is outside the limits of {value.field}; '
                     'use hold or nothing'
                 )
+            named = ' '.join((self.topic, value.field, value.measured)).lower()
+            if used and 'position' in named and not self.zero_is_a_safe_position:
+                raise ValueError(
+                    f'fallback {used[0]}: zeros would drive the positions of {value.field} to '
+                    'zero; use hold or nothing, or say zero_is_a_safe_position: true'
+                )
         return self
+
+
+class GoalMap(Settings):
+    """A map with obstacles, in which no goal can be."""
+
+    topic: TopicName = Field('map', description='topic of the nav_msgs/msg/OccupancyGrid')
+    occupied_above: int = Field(
+        50, ge=0, le=100, description='occupancy from which a cell is an obstacle, percent'
+    )
+    unknown_is_free: bool = Field(False, description='whether goals may be in unknown cells')
+    clearance_m: float = Field(
+        0.0, ge=0, le=100, description='distance to keep from obstacles, metres'
+    )
+
+
+class GoalSection(Settings):
+    """What a goal may fix, and when it is reached."""
+
+    tolerance: dict[str, Annotated[float, Field(gt=0)]] = Field(
+        min_length=1,
+        description='largest deviation at the goal by name: an observed value, or one with an '
+        'angle (radians); `distance`: straight from `position`, metres',
+    )
+    timeout_s: float = Field(
+        60.0, gt=0, le=86400, description='time that a goal may take, seconds'
+    )
+    yaw: str = Field(
+        '', description='observed heading that the orientation of a goal pose fixes; empty: none'
+    )
+    frame_id: str = Field(
+        '', description='frame of goal poses; empty: that of the first topic that names one'
+    )
+    beyond_data: float = Field(
+        0.0,
+        ge=0,
+        description='how far outside the range of the data a goal may lie, as a share of it',
+    )
+    map: GoalMap | None = Field(None, description='obstacles in which goals are refused')
+
+
+class Retrieval(Settings):
+    """How near a trajectory has to pass the robot to be adapted on."""
+
+    values: tuple[str, ...] = Field(
+        (), description='observed values that distances use; empty: `position`'
+    )
+    epsilon: float = Field(gt=0, description='largest distance, in units of these values')
 
 
 class Contract(Settings):
@@ -224,6 +313,10 @@ class Contract(Settings):
     act: tuple[CommandTopic, ...] = Field(min_length=1, description='topics that are written')
     position: tuple[str, str] | None = Field(
         None, description='names of the observed values that are x and y of the robot, metres'
+    )
+    goal: GoalSection | None = Field(None, description='goals of the robot; absent: it takes none')
+    retrieval: Retrieval | None = Field(
+        None, description='distances between states; absent: the settings of the programs'
     )
 
     @model_validator(mode='after')
@@ -240,6 +333,7 @@ class Contract(Settings):
             )
         wanted = chain(
             self.position or (),
+            self.retrieval.values if self.retrieval else (),
             *(measured_columns(value) for topic in self.act for value in topic.values),
         )
         if unknown := [name for name in wanted if name not in self.columns]:
@@ -251,7 +345,87 @@ class Contract(Settings):
                 raise ValueError(
                     f'timeout_s of {topic.topic} is shorter than a period, {1 / self.rate_hz:g} s'
                 )
+        self._check_goal()
         return self
+
+    def _check_goal(self) -> None:
+        if self.retrieval and not (self.retrieval.values or self.position):
+            raise ValueError('retrieval needs values, or the contract a position')
+        if self.goal is None:
+            return
+        names = {*self.columns, *self.groups, *(('distance',) if self.position else ())}
+        if unknown := [name for name in self.goal.tolerance if name not in names]:
+            raise ValueError(
+                f'goal: no value {unknown[0]} to tolerate (there are: {", ".join(sorted(names))})'
+            )
+        if self.goal.yaw and self.groups.get(self.goal.yaw, ('', False))[1] is False:
+            pairs = [name for name, (_, is_pair) in self.groups.items() if is_pair]
+            raise ValueError(
+                f'goal: yaw {self.goal.yaw} is no observed heading (there are: '
+                f'{", ".join(pairs) or "none"})'
+            )
+        if self.goal.yaw and self.goal.yaw not in self.goal.tolerance:
+            raise ValueError(f'goal: yaw needs a tolerance of {self.goal.yaw}')
+        if self.goal.map and not self.position:
+            raise ValueError('goal: a map takes a contract with a position')
+
+    @cached_property
+    def groups(self) -> dict[str, tuple[list[int], bool]]:
+        """Columns of each observed value by its name, and whether they are cosine and sine."""
+        found: dict[str, tuple[list[int], bool]] = {}
+        for value in chain.from_iterable(topic.values for topic in self.observe):
+            columns, _ = found.get(value.name or value.field, ([], False))
+            columns += [self.columns.index(name) for name in value.columns]
+            found[value.name or value.field] = (columns, value.is_pair)
+        return found
+
+    @cached_property
+    def meaning(self) -> dict[str, Any]:
+        """What the numbers of observations and actions stand for; plain data for a file.
+
+        Topics, deadlines and reactions are left out: they may change under the same policy.
+        """
+        observed = [
+            {name: getattr(value, name) for name in ('transform', 'scale', 'clamp', 'origin')}
+            for topic in self.observe
+            for value in topic.values
+            for _ in value.columns
+        ]
+        commanded = [
+            {'name': f'{joint}.{value.field}' if joint else value.field, 'low': low, 'high': high}
+            for topic in self.act
+            for value in topic.values
+            for joint, low, high in zip(
+                value.joints or [''] * value.num_values, *value.limits, strict=True
+            )
+        ]
+        meaning = {
+            'rate_hz': self.rate_hz,
+            'observations': [
+                {'name': name, **how} for name, how in zip(self.columns, observed, strict=True)
+            ],
+            'actions': commanded,
+        }
+        return json.loads(json.dumps(meaning))  # as a file gives it back
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What datasets and checkpoints keep of a contract; compared by `identity_fault`."""
+        text = json.dumps(self.meaning, sort_keys=True)
+        digest = hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+        return {
+            'robot': self.robot,
+            'fingerprint': digest,
+            'position_dims': list(self.position_dims),
+            'epsilon': self.retrieval.epsilon if self.retrieval else None,
+            **self.meaning,
+        }
+
+    @property
+    def position_dims(self) -> tuple[int, ...]:
+        """The columns of the values that distances between states use; empty: none are named."""
+        names = (self.retrieval.values if self.retrieval else ()) or self.position or ()
+        return tuple(self.columns.index(name) for name in names)
 
     @cached_property
     def columns(self) -> list[str]:
@@ -263,6 +437,11 @@ class Contract(Settings):
     def topics(self) -> list[ObservedTopic | CommandTopic]:
         """All topics, those that are read first."""
         return [*self.observe, *self.act]
+
+    @property
+    def frame_id(self) -> str:
+        """Frame of the observations: that of the first topic that names one; empty: none does."""
+        return next((topic.frame_id for topic in self.observe if topic.frame_id), '')
 
     @property
     def obs_dim(self) -> int:

@@ -37,6 +37,7 @@ class Observer:
             contract: The contract to evaluate.
         """
         self._topics = {topic.topic: topic for topic in contract.observe}
+        self._period_ns = contract.period_ns
         self._newest: dict[str, _Reading] = {}
         self._is_broken = True
         self.segment = 0
@@ -52,7 +53,8 @@ class Observer:
         """
         observed = self._topics[topic]
         before = self._newest.get(topic)
-        if before and received_ns - before.received_ns > _nanoseconds(observed.timeout_s):
+        silent_ns = received_ns - before.received_ns if before else 0
+        if observed.align != 'hold' and silent_ns > _nanoseconds(observed.timeout_s):
             before = None
             self._is_broken = True
         try:
@@ -83,7 +85,11 @@ class Observer:
             newest = self._newest.get(name)
             if newest is None:
                 return f'{name}: no usable message yet'
-            if now_ns - newest.stamp_ns > _nanoseconds(topic.timeout_s):
+            if topic.align == 'hold':
+                continue
+            is_drop = topic.align == 'drop'
+            limit_ns = self._period_ns if is_drop else _nanoseconds(topic.timeout_s)
+            if now_ns - newest.stamp_ns > limit_ns:
                 age_s = (now_ns - newest.stamp_ns) / 1e9
                 return f'{name}: the newest usable message is {age_s:.2f} s old'
         return ''
@@ -112,7 +118,8 @@ def _stamp(topic: ObservedTopic, message: Any, received_ns: int) -> int:
         return received_ns
     stamp_ns = stamp_of(message)
     behind_ns = received_ns - stamp_ns
-    if abs(behind_ns) > _nanoseconds(topic.timeout_s):
+    may_be_old = topic.align == 'hold' and behind_ns > 0
+    if abs(behind_ns) > _nanoseconds(topic.timeout_s) and not may_be_old:
         side = 'before' if behind_ns > 0 else 'after'
         raise MessageError(
             f'stamped {abs(behind_ns) / 1e9:g} s {side} its reception: late, or another clock'

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 import hashlib
-import json
 from pathlib import Path
 import re
 from typing import Any
@@ -17,7 +16,8 @@ from torch import Tensor
 from metagcttt_core.agents import AGENTS
 from metagcttt_core.agents.agent import Agent, OptimizerState
 from metagcttt_core.config.settings import error_lines, Settings
-from metagcttt_core.files import atomic_write, write_json
+from metagcttt_core.data.scaling import Scaling
+from metagcttt_core.files import atomic_write, read_json, write_json
 
 FORMAT_VERSION = 1
 _INDEX = 'checkpoint.json'
@@ -59,6 +59,7 @@ class _Index(Settings):
     act_dim: int = Field(ge=1)
     settings: dict[str, Any]
     metadata: dict[str, Any]
+    scaling: dict[str, Any] | None = None
     weights: str = Field(pattern=r'^weights-[0-9a-f]{16}\.safetensors$')
     training: _Training | None = None
 
@@ -101,13 +102,16 @@ def save_checkpoint(agent: Agent, path: str | Path, training: TrainingState | No
         act_dim=agent.act_dim,
         settings=agent.settings.model_dump(mode='json'),
         metadata=agent.metadata,
+        scaling=None if agent.scaling.is_identity else agent.scaling.to_json(),
         weights=weights,
         training=training
         and _Training(stage=training.stage, step=training.step, settings=training.settings),
     )
     with atomic_write(folder / weights) as file:
         file.write(content)
-    write_json(folder / _INDEX, index.model_dump(mode='json'))
+    # Without a scaling, programs of before there was one can read it.
+    unused = set() if index.scaling else {'scaling'}
+    write_json(folder / _INDEX, index.model_dump(mode='json', exclude=unused))
     for old in folder.glob('weights-*.safetensors'):
         if old.name != weights:
             old.unlink()
@@ -146,8 +150,9 @@ def load_checkpoint(
         settings = agent_type.settings_type(**index.settings | dict(changes or {}))
     except ValidationError as error:
         raise CheckpointError(f'{folder}: settings: {"; ".join(error_lines(error))}') from error
-    agent = agent_type(index.obs_dim, index.act_dim, settings, torch.Generator())
-    own = agent.state_dict()
+    with torch.device('meta'):  # shapes alone: an index may announce more than memory holds
+        shapes = agent_type(index.obs_dim, index.act_dim, settings, torch.Generator('cpu'))
+    own = shapes.state_dict()
     saved = {name[6:]: tensor for name, tensor in tensors.items() if name.startswith('agent.')}
     missing, unknown = sorted(own.keys() - saved.keys()), sorted(saved.keys() - own.keys())
     if missing or unknown:
@@ -166,6 +171,12 @@ def load_checkpoint(
             )
         if not torch.isfinite(saved[name]).all():
             raise CheckpointError(f'{folder}: weight {name} holds a non-finite value')
+    agent = agent_type(index.obs_dim, index.act_dim, settings, torch.Generator())
+    if index.scaling is not None:
+        try:
+            agent.scaling = Scaling.from_json(index.scaling, index.obs_dim, index.act_dim)
+        except (ValueError, TypeError) as error:
+            raise CheckpointError(f'{folder}: {error}') from error
     agent.load_state_dict(saved)
     agent.metadata = dict(index.metadata)
     own_run = index.training is not None and index.training.stage == _PRETRAINING
@@ -238,12 +249,12 @@ def _folder(path: str | Path) -> Path:
 def _read_index(folder: Path) -> _Index:
     file = folder / _INDEX
     try:
-        values = json.loads(file.read_text(encoding='utf-8'))
+        values = read_json(file)
     except (FileNotFoundError, NotADirectoryError) as error:
         raise CheckpointError(f'{folder}: no checkpoint there ({_INDEX} is missing)') from error
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise CheckpointError(f'{file}: not valid JSON ({error})') from error
-    if not isinstance(values, dict) or values.get('format') != 'metagcttt-checkpoint':
+    except (OSError, ValueError) as error:
+        raise CheckpointError(str(error)) from error
+    if values.get('format') != 'metagcttt-checkpoint':
         raise CheckpointError(f'{file}: not a checkpoint of this project (format is missing)')
     if values.get('version') != FORMAT_VERSION:
         raise CheckpointError(

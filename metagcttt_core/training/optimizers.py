@@ -2,12 +2,15 @@
 
 from collections.abc import Callable, Iterable
 import copy
+import ctypes
 from functools import partial
+import math
 
 import torch
 from torch import nn
 
 from metagcttt_core.agents.agent import Agent, OptimizerState
+from metagcttt_core.kernels import Kernels
 from metagcttt_core.training.config import OptimizerName
 
 # Fused: one kernel over all parameters. Torch's Adam adds eps after bias correction, as optax
@@ -39,6 +42,53 @@ def make_optimizer(
         # Torch keeps the very tensors it is given and steps them in place.
         optimizer.load_state_dict({**optimizer.state_dict(), 'state': copy.deepcopy(state)})
     return optimizer
+
+
+class KernelAdam:
+    """The steps of a `torch.optim.Adam`, whose state it advances, as one call for all weights."""
+
+    def __init__(self, optimizer: torch.optim.Adam, kernels: Kernels) -> None:
+        """Go on from the state that `optimizer` has; gradients stay where they are now."""
+        (self._group,) = optimizer.param_groups
+        parameters = self._group['params']
+        for parameter in parameters:
+            if not optimizer.state[parameter]:
+                optimizer.state[parameter] = {
+                    'step': torch.tensor(0.0),
+                    'exp_avg': torch.zeros_like(parameter),
+                    'exp_avg_sq': torch.zeros_like(parameter),
+                }
+        states = [optimizer.state[parameter] for parameter in parameters]
+        self._steps = [state['step'] for state in states]
+        self._taken = int(self._steps[0])
+        arrays = [
+            parameters,
+            [parameter.grad for parameter in parameters],
+            [state['exp_avg'] for state in states],
+            [state['exp_avg_sq'] for state in states],
+        ]
+        self._kept = arrays
+        number = len(parameters)
+        sizes = (ctypes.c_int64 * number)(*(parameter.numel() for parameter in parameters))
+        addresses = [
+            (ctypes.c_void_p * number)(*(array.data_ptr() for array in kind)) for kind in arrays
+        ]
+        self._arguments = (number, sizes, *addresses)
+        self._kernels = kernels
+
+    def step(self) -> None:
+        """Take a step by the gradients."""
+        self._taken += 1
+        torch._foreach_add_(self._steps, 1)
+        beta1, beta2 = self._group['betas']
+        self._kernels.adam(
+            *self._arguments,
+            beta1,
+            beta2,
+            self._group['lr'] / (1 - beta1**self._taken),
+            math.sqrt(1 - beta2**self._taken),
+            self._group['eps'],
+        )
 
 
 def pretrained_state(agent: Agent, *, actor_only: bool = False) -> OptimizerState:

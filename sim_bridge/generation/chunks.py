@@ -1,12 +1,11 @@
 """Resumable storage of a dataset in progress: finished chunks in a folder."""
 
 from dataclasses import dataclass
-import json
 from pathlib import Path
 from typing import Any
 import zipfile
 
-from metagcttt_core.files import atomic_write, claim_folder, remove_claimed, write_json
+from metagcttt_core.files import atomic_write, claim_folder, read_json, remove_claimed, write_json
 import numpy as np
 
 from sim_bridge.generation.episodes import Episode
@@ -93,7 +92,7 @@ class ChunkFolder:
         """
         file = self.path / _SETTINGS
         try:
-            return json.loads(file.read_text(encoding='utf-8'))
+            return read_json(file)
         except ValueError as error:
             raise GenerationError(f'{file} is damaged ({error}): remove {self.path}') from error
 

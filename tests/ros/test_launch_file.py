@@ -9,7 +9,7 @@ from pathlib import Path
 import re
 import runpy
 import sys
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 from lifecycle_msgs.msg import Transition
@@ -35,12 +35,13 @@ class Recorder:
 
 
 NAMES = {
-    'launch': ['LaunchDescription'],
+    'launch': ['Action', 'LaunchContext', 'LaunchDescription'],
     'launch.actions': [
         'DeclareLaunchArgument',
         'EmitEvent',
         'GroupAction',
         'IncludeLaunchDescription',
+        'OpaqueFunction',
         'RegisterEventHandler',
         'SetEnvironmentVariable',
         'Shutdown',
@@ -48,6 +49,9 @@ NAMES = {
     'launch.conditions': ['IfCondition'],
     'launch.events': [],
     'launch.events.matchers': ['matches_action'],
+    'launch.events.process': ['ProcessExited'],
+    'launch.launch_context': ['LaunchContext'],
+    'launch.logging': ['get_logger'],
     'launch.launch_description_sources': ['PythonLaunchDescriptionSource'],
     'launch.substitutions': [
         'EnvironmentVariable',
@@ -68,29 +72,31 @@ NAMES = {
 class Launched:
     """What a launch file describes."""
 
-    def __init__(self, entities: list[Recorder]) -> None:
-        self.entities = [inner for entity in entities for inner in _inside(entity)]
+    def __init__(self, entities: list[Recorder], given: dict[str, str]) -> None:
         self.arguments = {
             e.args[0]: e.kwargs for e in entities if e.kind == 'DeclareLaunchArgument'
         }
-        self.nodes = {
-            e.kwargs['executable']: e for e in entities if e.kind in ('Node', 'LifecycleNode')
-        }
+        defaults = {name: kwargs['default_value'] for name, kwargs in self.arguments.items()}
+        context = SimpleNamespace(launch_configurations=defaults | given, argv=[])
+        self.entities = [inner for entity in entities for inner in _inside(entity, context)]
+        self.nodes = {e.kwargs['executable']: e for e in self.entities if e.kind.endswith('Node')}
 
     def of_kind(self, kind: str) -> list[Recorder]:
         return [entity for entity in self.entities if entity.kind == kind]
 
 
-def _inside(entity: Recorder) -> Iterator[Recorder]:
-    """An entity and those in a group."""
+def _inside(entity: Recorder, context: SimpleNamespace) -> Iterator[Recorder]:
+    """An entity and those in a group or made by a function."""
     yield entity
     if entity.kind == 'GroupAction':
         for inner in entity.args[0]:
-            yield from _inside(inner)
+            yield from _inside(inner, context)
+    if entity.kind == 'OpaqueFunction':
+        yield from entity.kwargs['function'](context) or ()
 
 
 @pytest.fixture
-def launch(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Launched]:
+def launch(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Launched]:
     """Runs a launch file."""
     for module, classes in NAMES.items():
         fake = ModuleType(module)
@@ -100,10 +106,10 @@ def launch(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Launched]:
 
     monkeypatch.delitem(sys.modules, 'metagcttt.launch_arguments', raising=False)
 
-    def run(name: str) -> Launched:
+    def run(name: str, **given: str) -> Launched:
         names = runpy.run_path(str(PACKAGE / 'launch' / f'{name}.launch.py'))
         [entities] = names['generate_launch_description']().args
-        return Launched(entities)
+        return Launched(entities, given)
 
     return run
 
@@ -115,7 +121,7 @@ def given_arguments(include: Recorder) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ('file', 'finite'),
     [
-        ('lifecycle', {'stepping'}),
+        ('lifecycle', {'stepping', 'use_sim_time', 'log_level', 'visualize', 'rviz'}),
         (
             'metagcttt',
             {
@@ -128,7 +134,10 @@ def given_arguments(include: Recorder) -> dict[str, Any]:
                 'rviz',
             },
         ),
-        ('two_robots', {'stepping', 'visualize', 'log_level'}),
+        (
+            'two_robots',
+            {'stepping', 'autostart', 'use_sim_time', 'visualize', 'log_level'},
+        ),
     ],
 )
 def test_arguments_are_described_and_finite_ones_list_their_values(
@@ -145,9 +154,11 @@ def test_arguments_are_described_and_finite_ones_list_their_values(
 def test_every_configuration_that_is_used_is_declared(launch, file: str) -> None:
     text = (PACKAGE / 'launch' / f'{file}.launch.py').read_text(encoding='utf-8')
     launched = launch(file)
-    used = re.findall(r"(?:LaunchConfiguration|text|flag)\('(\w+)'\)", text)
+    used = set(re.findall(r"LaunchConfiguration\('(\w+)'\)", text))
+    for names in re.findall(r'given\(context, ([^)]*)\)', text):
+        used |= set(re.findall(r"'(\w+)'", names))
     assert used
-    assert set(used) <= launched.arguments.keys()
+    assert used <= launched.arguments.keys()
 
 
 def test_one_robot_has_all_nodes_under_their_names(launch) -> None:
@@ -227,3 +238,85 @@ def test_parameter_file_fits_the_nodes(stepping: str) -> None:
         for key, value in values.items():
             assert type(value) is type(table[key].default), key
             assert table[key].refusal(value) == ''
+
+
+@pytest.mark.parametrize('file', FILES)
+def test_no_argument_masks_the_parameter_file_unless_it_is_given(launch, file: str) -> None:
+    """`autostart` and `output` are what the file is about; time comes from the simulator."""
+    theirs = {'autostart', 'output', 'use_sim_time'}
+    for node in launch(file).nodes.values():
+        parts = [part for part in node.kwargs.get('parameters', []) if isinstance(part, dict)]
+        assert {key for part in parts for key in part} <= theirs
+
+
+def test_an_argument_that_is_given_becomes_a_parameter_of_every_node_that_has_it(launch) -> None:
+    nodes = launch('metagcttt', dataset='1.npz', environment='pointmaze-large-v0').nodes
+    for name in OF_A_MAZE - {'recorder_node'}:
+        keys = {parameter.name for parameter in TABLES[name]} & {'dataset', 'environment'}
+        merged: dict[str, Any] = {}
+        for part in nodes[name].kwargs['parameters']:
+            merged |= part if isinstance(part, dict) else {}
+        assert {key: merged[key].args for key in keys} == {
+            key: {'dataset': ('1.npz',), 'environment': ('pointmaze-large-v0',)}[key]
+            for key in keys
+        }
+
+
+@pytest.mark.parametrize(
+    ('argv', 'problem'),
+    [
+        (['steping:=lockstep'], 'metagcttt.launch.py has no argument steping; it has '),
+        (['stepping:=lockstep', 'params_file:=a.yaml'], 'give one of them'),
+        (['stepping:=lockstep', 'sigterm_timeout:=9', 'launch-prefix:=nice'], ''),
+        (['params_file:=a.yaml', 'record:=a.mcap'], ''),
+    ],
+)
+def test_argument_that_would_be_ignored_is_refused(
+    launch, monkeypatch: pytest.MonkeyPatch, argv: list[str], problem: str
+) -> None:
+    [check] = [e for e in launch('metagcttt').of_kind('OpaqueFunction')][:1]
+    refuse = check.kwargs['function']
+    context = SimpleNamespace(argv=argv)
+    refuse(context)  # another file was launched, and includes this one
+    monkeypatch.setattr(sys, 'argv', ['ros2', 'launch', 'metagcttt', 'metagcttt.launch.py', *argv])
+    if problem:
+        with pytest.raises(ValueError, match=problem):
+            refuse(context)
+    else:
+        refuse(context)
+
+
+def test_respawn_limit_that_is_no_number_is_refused(launch) -> None:
+    for text in ('-1', 'three', '', '1.5'):
+        with pytest.raises(ValueError, match='respawn_limit must be 0 or a positive number'):
+            launch('metagcttt', respawn_limit=text)
+
+
+@pytest.mark.parametrize('limit', [0, 1, 3])
+def test_node_that_ends_too_often_ends_all_with_a_word(
+    launch, monkeypatch: pytest.MonkeyPatch, limit: int
+) -> None:
+    nodes = launch('metagcttt', respawn_limit=str(limit)).nodes
+    ours = [node for name, node in nodes.items() if name != 'rviz2']
+    assert all(node.kwargs['respawn'] is True for node in ours)
+    on_exit = nodes['goal_node'].kwargs['on_exit']
+    module = sys.modules['metagcttt.launch_arguments']
+    said: list[str] = []
+    log = SimpleNamespace(warning=said.append, error=said.append)
+    monkeypatch.setattr(module, 'get_logger', lambda _: log)
+    now = 1000.0
+    monkeypatch.setattr(module.time, 'monotonic', lambda: now)
+    event = SimpleNamespace(process_name='goal_node-2', returncode=-9)
+    running = SimpleNamespace(is_shutdown=False)
+    assert on_exit(event, SimpleNamespace(is_shutdown=True)) == []
+    for number in range(limit):
+        assert on_exit(event, running) == []
+        assert said[number].startswith('goal_node-2 ended with exit code -9 and is started again')
+    now += 61.0  # what was long ago does not count
+    if limit:
+        assert on_exit(event, running) == []
+    for _ in range(limit - 1):
+        on_exit(event, running)
+    [shutdown] = on_exit(event, running)
+    assert shutdown.kind == 'Shutdown'
+    assert said[-1] == 'goal_node-2 ended with exit code -9: shutting down all nodes'

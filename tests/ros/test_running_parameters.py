@@ -6,7 +6,7 @@ import re
 
 from metagcttt.parameters import TABLES
 from metagcttt.sim.node import SimBridgeNode
-from metagcttt_core import make_agent, save_checkpoint
+from metagcttt_core import kernels, make_agent, save_checkpoint
 from metagcttt_interfaces.action import ReachGoal
 from metagcttt_interfaces.msg import ActionCommand, MazeState
 import pytest
@@ -59,6 +59,8 @@ def critic_files(tmp_path: Path, dataset_file: Path) -> dict[str, str]:
         ('adapt_lr', 0.03, 'train_losses'),
         ('adapt_batch_size', 16, 'train_losses'),
         ('actor_only', True, 'train_losses'),
+        ('engine', 'eager', 'train_losses'),
+        ('precision', 'bfloat16', 'train_losses'),
         ('optimizer_state', 'pretrained', 'train_losses'),
         ('early_stopping', False, 'test_losses'),
         ('test_fraction', 0.5, 'test_losses'),
@@ -87,6 +89,23 @@ def test_optimizer_state_that_the_checkpoint_lacks_is_refused(
     assert not result.successful
     assert 'bare: has no optimiser state of pre-training' in result.reason
     assert rig.node.get_parameter('optimizer_state').value == 'fresh'
+
+
+def test_engine_without_a_compiler(
+    graph: Graph, checkpoint_folder: Path, dataset_file: Path, tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
+    monkeypatch.setenv('CC', 'no-such-compiler')
+    kernels._find.cache_clear()
+    monkeypatch.setattr(kernels, '_find', kernels._find.__wrapped__)
+    rig = PolicyRig(graph, {'checkpoint': str(checkpoint_folder), 'dataset': str(dataset_file)})
+    rig.state()
+    rig.goal(1)
+    assert rig.report(1).accepted
+    assert rig.session.examine().values['adapt_engine'] == 'analytic'
+    [result] = rig.node.set_parameters([Parameter('engine', value='kernels')])
+    assert 'engine kernels: no-such-compiler: ' in result.reason
+    assert rig.node.get_parameter('engine').value == 'auto'
 
 
 def test_next_goal_is_adapted_to_anew_after_the_horizon(

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from metagcttt_core.config import Settings
+from metagcttt_core.files import read_json_lines
 import numpy as np
 from pydantic import Field
 
 from metagcttt_tools.common.cli import fail, parse
-from metagcttt_tools.common.run_log import METRICS, read_metrics
+from metagcttt_tools.common.run_log import METRICS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,7 +48,7 @@ def main(argv: list[str] | None = None) -> None:
     path = settings.run / METRICS
     if not path.is_file():
         fail(f'{settings.run}: no run of metagcttt meta-train there ({METRICS} is missing)')
-    lines = read_metrics(path)
+    lines = read_json_lines(path)
     records = [line for line in lines if 'inner/best_step' in line]
     if not records:
         fail(f'{path}: holds no record of meta-post-training')

@@ -15,7 +15,7 @@ from metagcttt_tools.common.cli import fail, parse
 if TYPE_CHECKING:
     from metagcttt_tools.recordings.trajectories import RecordingSummary
 
-_DESCRIPTION = """Turn MCAP recordings of recorder_node into a dataset (.npz).
+_DESCRIPTION = """Turn recordings of recorder_node or `ros2 bag record` into a dataset (.npz).
 
 Example: metagcttt import-recordings --recordings run.mcap --out data/run.npz
 State k goes with the action that led to state k + 1; where one of them is missing, the trajectory
@@ -26,7 +26,7 @@ class RecordingSettings(Settings):
     """Settings of the program."""
 
     recordings: tuple[Path, ...] = Field(
-        (), description='MCAP files; those of one split recording in order'
+        (), description='.mcap or .db3 files, or bag folders; files of a split one in order'
     )
     out: Path = Field(Path('data/recorded.npz'), description='dataset to write')
     extend: Path | None = Field(

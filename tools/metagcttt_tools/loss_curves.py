@@ -10,6 +10,7 @@ from metagcttt_core import FilterConfig, TrajectoryDataset, TrajectoryFilter, TT
 from metagcttt_core.adaptation.config import TTTLoopConfig
 from metagcttt_core.agents.config import ActorLoss
 from metagcttt_core.config import Settings
+from metagcttt_core.files import read_json_lines
 from metagcttt_core.retrieval.support import SupportSet
 import numpy as np
 from pydantic import Field
@@ -17,7 +18,7 @@ from sim_bridge import make_simulator
 
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.results import markdown_table, write_report
-from metagcttt_tools.common.run_log import METRICS, read_metrics
+from metagcttt_tools.common.run_log import METRICS
 from metagcttt_tools.common.session import use_threads
 
 if TYPE_CHECKING:
@@ -145,7 +146,7 @@ def pretraining_curves(run: Path) -> tuple[list[int], Curves]:
         OSError: If the run has no log.
         ValueError: If the log holds no training losses.
     """
-    records = [record for record in read_metrics(run / METRICS) if 'train/loss' in record]
+    records = [record for record in read_json_lines(run / METRICS) if 'train/loss' in record]
     if not records:
         raise ValueError(f'{run / METRICS} holds no training losses')
     curves: Curves = {}

@@ -39,11 +39,17 @@ PROGRAMS: dict[str, Program | Group] = {
     'download': Program('download', "Download one of OGBench's published datasets."),
     'import-recordings': Program('import_recordings', 'Turn recordings into a dataset.'),
     'import-bags': Program('import_bags', 'Turn bags of a robot into a dataset, by its contract.'),
+    'import-table': Program('import_table', 'Turn CSV or parquet files into a dataset.'),
+    'import-lerobot': Program('import_lerobot', 'Turn a LeRobotDataset v3 into a dataset.'),
+    'export-lerobot': Program('export_lerobot', 'Write a dataset as a LeRobotDataset v3.'),
     'inspect': Program('inspect_data', 'Say what is in a dataset, and draw its coverage.'),
     'pretrain': Program('pretrain', 'Pre-train a policy on an offline dataset.'),
     'convert': Program('convert', "Convert a policy trained with OGBench's own code."),
     'meta-train': Program('meta_train', 'Meta-post-train a policy (Algorithm 1).'),
     'evaluate': Program('evaluate', 'Success of policies by test-time training budget.'),
+    'evaluate-offline': Program(
+        'evaluate_offline', 'Action error on held-out data, without a simulator.'
+    ),
     'evaluate-ros': Program('evaluate_ros', 'The same, driven through the ROS graph.'),
     'sweep': Program('sweep', 'Run a whole study: training, post-training, evaluation.'),
     'report': Program('report', 'Tables and figures of a study.'),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
-from typing import Annotated, Any, Self, TYPE_CHECKING
+from typing import Annotated, Any, Literal, Self, TYPE_CHECKING
 
 from metagcttt_core import DatasetError, TrajectoryDataset
 from metagcttt_core.agents import AgentName, AGENTS
@@ -48,6 +48,11 @@ class PretrainSettings(RunSettings):
     gcbc: Annotated[GCBCOptions, tyro.conf.AvoidSubcommands] = GCBCOptions()
     gciql: Annotated[GCIQLOptions, tyro.conf.AvoidSubcommands] = GCIQLOptions()
     saw: Annotated[SAWOptions, tyro.conf.AvoidSubcommands] = SAWOptions()
+    standardise: Literal['auto', 'yes', 'no'] = Field(
+        'auto',
+        description='give networks observations of mean 0 and deviation 1; auto: for the data of '
+        "a robot's contract",
+    )
     training: PretrainConfig = PretrainConfig()
     precision: Precision = Field(
         'float32', description='of matrix products; auto is bfloat16 where the device gains by it'
@@ -115,6 +120,7 @@ def main(argv: list[str] | None = None) -> None:
 
 def _run(settings: PretrainSettings) -> None:
     from metagcttt_core import make_agent, save_checkpoint
+    from metagcttt_core.data import Scaling
     from metagcttt_core.training.numerics import resolve_precision
     from metagcttt_core.training.pretrain import pretrain
 
@@ -135,10 +141,13 @@ def _run(settings: PretrainSettings) -> None:
         seed=settings.seed,
         **settings.agent_settings,
     ).to(settings.device)
+    standardise = {'auto': dataset.contract is not None, 'yes': True, 'no': False}
+    agent.scaling = Scaling.of(dataset, standardise=standardise[settings.standardise])
     precision = resolve_precision(settings.precision, agent)
     decisive = settings.decisive() | {'dataset': dataset.fingerprint, 'precision': precision}
     agent.metadata = {
         'environment': settings.environment,
+        **({'contract': dataset.contract} if dataset.contract else {}),
         'history': [history_entry('pretrain', settings, decisive)],
     }
     held_out = validation_data(settings.dataset, dataset)

@@ -1,23 +1,22 @@
 """Tables and figures of a study (paper, figures 3 to 5 and table 1)."""
 
-import json
 from pathlib import Path
 import shlex
 from typing import Any
 
 from metagcttt_core import normalized_auc, success_statistics
-from metagcttt_core.config import Settings
+from metagcttt_core.config import error_lines, Settings
 from metagcttt_core.evaluation import adaptation_efficiency
-from metagcttt_core.files import write_json
+from metagcttt_core.files import read_json, write_json
 import numpy as np
-from pydantic import Field
+from pydantic import Field, ValidationError
 import tyro
 
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.differences import differences
 from metagcttt_tools.common.evidence import format_evidence, read_evidence
-from metagcttt_tools.common.manifest import BASE, Evaluation, Manifest
-from metagcttt_tools.common.results import markdown_table
+from metagcttt_tools.common.manifest import BASE, Evaluation, FILE, Manifest
+from metagcttt_tools.common.results import markdown_table, Results
 
 _DESCRIPTION = """Tables and figures of a study that metagcttt sweep ran.
 
@@ -73,7 +72,7 @@ def rebuild(folder: Path) -> str:
     """
     evidence = read_evidence(folder / 'paper.yaml')
     for name in sorted({name for artefact in evidence.artefacts for name in artefact.files}):
-        results = _read_json(folder / name) if name.endswith('.json') else {}
+        results = read_json(folder / name) if name.endswith('.json') else {}
         if 'adaptations' in results:
             results['curve'] = {  # JSON has no numbers for names
                 arm: {float(fraction): point for fraction, point in points.items()}
@@ -170,9 +169,20 @@ def _restrict(summary: dict[str, Any], budgets: list[int]) -> dict[str, Any]:
 def _rates(folder: Path, evaluation: Evaluation) -> Rates:
     """The success rates in the file of an evaluation."""
     rates: Rates = {}
-    results = _read_json(folder / evaluation.file)['results']
+    path = folder / evaluation.file
+    try:
+        results = Results.model_validate(read_json(path)).results
+    except FileNotFoundError as error:
+        raise ValueError(f'{path} does not exist: run metagcttt sweep to its end first') from error
+    except ValidationError as error:
+        raise ValueError(f'{path}: {"; ".join(error_lines(error))}') from error
+    if len(results) != len(evaluation.policies):
+        raise ValueError(
+            f'{path}: holds results of {len(results)} policies, '
+            f'{FILE} lists {len(evaluation.policies)}'
+        )
     for policy, result in zip(evaluation.policies, results, strict=True):
-        points = {point['budget']: point['success'] for point in result['curve']}
+        points = {point.budget: point.success for point in result.curve}
         rates.setdefault((policy.arm, policy.fraction), {})[policy.seed] = points
     return rates
 
@@ -278,9 +288,3 @@ def _curve_table(curve: dict[str, Any]) -> str:
 def _cells(summary: dict[str, Any]) -> dict[str, str]:
     rates = zip(summary['budgets'], summary['success'], summary['standard_error'], strict=True)
     return {f'K = {budget}': f'{mean:.2f} ± {error:.2f}' for budget, mean, error in rates}
-
-
-def _read_json(path: Path) -> Any:
-    if not path.is_file():
-        raise ValueError(f'{path} does not exist: run metagcttt sweep to its end first')
-    return json.loads(path.read_text(encoding='utf-8'))

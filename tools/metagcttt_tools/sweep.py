@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from concurrent.futures import as_completed, ThreadPoolExecutor
 from itertools import chain
-import json
 import math
 from pathlib import Path
 import signal
@@ -15,6 +14,7 @@ from typing import Annotated, Any
 from metagcttt_core import MetaConfig
 from metagcttt_core.agents.config import ActorLoss
 from metagcttt_core.config import Settings
+from metagcttt_core.files import read_json
 from pydantic import Field, model_validator
 from tqdm import tqdm
 import tyro
@@ -303,6 +303,8 @@ def is_evaluated(settings: EvaluateSettings) -> bool:
     if not settings.out.exists():
         return False
     free = {'processes', 'out', 'resume'}
-    done = json.loads(settings.out.read_text(encoding='utf-8'))['settings']
+    done = read_json(settings.out).get('settings')
+    if not isinstance(done, dict):
+        raise ValueError(f'{settings.out}: holds no results of metagcttt evaluate')
     wanted = settings.model_dump(mode='json', exclude=free)
     return {name: value for name, value in done.items() if name not in free} == wanted

@@ -2,7 +2,8 @@
 
 from metagcttt_core.agents import GCBC
 from metagcttt_core.agents.networks import MLP
-from metagcttt_core.agents.passes import Passes
+from metagcttt_core.agents.passes import FusedPasses, TensorPasses
+from metagcttt_core.kernels import load_kernels
 import pytest
 from tests.core.adaptation.test_inner_loop import batches_for
 from tests.core.builders import tiny_agent
@@ -18,18 +19,24 @@ LEARNERS = pytest.mark.parametrize(
     ],
 )
 WIDE = {'hidden': (160, 144)}  # whose products with 160 rows go to oneDNN
+WAYS = pytest.mark.parametrize('way', ['tensor operations', 'kernels'])
+
+
+def kernels_of(way):
+    return load_kernels() if way == 'kernels' else None
 
 
 def relative_error(found, expected) -> float:
     return ((found - expected).norm() / expected.norm()).item()
 
 
+@WAYS
 @LEARNERS
 @pytest.mark.parametrize('actor_only', [False, True])
 @pytest.mark.parametrize(('shape', 'rows'), [({}, 16), (WIDE, 160)], ids=['tiny', 'wide'])
-def test_loss_parts_and_gradients_equal_autograd(name, settings, actor_only, shape, rows):
+def test_loss_parts_and_gradients_equal_autograd(name, settings, actor_only, shape, rows, way):
     agent = tiny_agent(name, **settings, **shape)
-    loss_of = agent.analytic_loss(actor_only=actor_only)
+    loss_of = agent.analytic_loss(actor_only=actor_only, kernels=kernels_of(way))
     for batch in batches_for(agent, 2, size=rows):  # the second in the memory of the first
         loss, parts = agent.losses(batch, actor_only=actor_only)
         gradients = torch.autograd.grad(
@@ -42,13 +49,17 @@ def test_loss_parts_and_gradients_equal_autograd(name, settings, actor_only, sha
             assert relative_error(written, expected) < 2e-5
 
 
+@WAYS
 @LEARNERS
 @pytest.mark.parametrize('actor_only', [False, True])
-def test_products_in_bfloat16_move_the_gradients_by_their_rounding(name, settings, actor_only):
+def test_products_in_bfloat16_move_the_gradients_by_their_rounding(
+    name, settings, actor_only, way
+):
     agent = tiny_agent(name, **settings, hidden=(64, 64))
     (batch,) = batches_for(agent, 1, size=256)
-    exact = agent.analytic_loss(actor_only=actor_only)
-    rounded = agent.analytic_loss(actor_only=actor_only, dtype=torch.bfloat16)
+    shared = {'actor_only': actor_only, 'kernels': kernels_of(way)}
+    exact = agent.analytic_loss(**shared)
+    rounded = agent.analytic_loss(**shared, dtype=torch.bfloat16)
     exact(batch)
     rounded(batch)
     errors = [
@@ -58,11 +69,12 @@ def test_products_in_bfloat16_move_the_gradients_by_their_rounding(name, setting
     assert all(gradient.dtype == torch.float32 for gradient in rounded.gradients)
 
 
+@WAYS
 @LEARNERS
-def test_loss_without_backward_leaves_the_gradients(name, settings):
+def test_loss_without_backward_leaves_the_gradients(name, settings, way):
     agent = tiny_agent(name, **settings)
     first, second = batches_for(agent, 2)
-    loss_of = agent.analytic_loss()
+    loss_of = agent.analytic_loss(kernels=kernels_of(way))
     loss_of(first)
     kept = [gradient.clone() for gradient in loss_of.gradients]
     loss, _ = loss_of(second, backward=False)
@@ -94,14 +106,20 @@ def test_learned_deviation_and_subclasses_have_none(name):
     assert subclassed.analytic_loss() is None
 
 
+@WAYS
 @pytest.mark.parametrize('layer_norm', [False, True])
-@pytest.mark.parametrize('without_onednn', [False, True])
-def test_passes_equal_the_module(layer_norm, without_onednn, monkeypatch):
-    if without_onednn:
-        monkeypatch.setattr('metagcttt_core.agents.passes._OPS', None)
+@pytest.mark.parametrize('products', ['as found', 'without oneDNN', 'slow BLAS', 'by layer'])
+def test_passes_equal_the_module(layer_norm, products, way, monkeypatch):
+    passes_module = 'metagcttt_core.agents.passes'
+    if products == 'without oneDNN':
+        monkeypatch.setattr(f'{passes_module}._OPS', None)
+    elif products == 'slow BLAS':
+        monkeypatch.setattr(f'{passes_module}._blas_keeps_up', lambda: False)
+    elif products == 'by layer':
+        monkeypatch.setattr(f'{passes_module}._ONE_CALL', 0)
     generator = torch.Generator().manual_seed(0)
     mlp = MLP(5, (130, 140), 3, layer_norm=layer_norm, generator=generator)
-    passes = Passes(mlp)
+    passes = FusedPasses(mlp, load_kernels()) if way == 'kernels' else TensorPasses(mlp)
     for rows in (7, 200):
         inputs = torch.randn(rows, 5, generator=generator, requires_grad=True)
         upstream = torch.randn(rows, 3, generator=generator)

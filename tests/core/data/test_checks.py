@@ -88,17 +88,13 @@ def test_next_observations_in_another_order_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ('arrays', 'told'),
     [
-        ({'actions': 3 * walk()['actions']}, ['actions reach 2.9', 'scale them']),
+        ({'actions': 3 * walk()['actions']}, ['actions reach 2.9', 'scales them']),
         (
             {'observations': two_walks()},
             ['from row 29 to the next', 'jump by'],
         ),
-        (
-            {'observations': walk()['observations'].astype(np.float64) * 0.05 + (4e5, 0)},
-            ['observations[:, 0] loses', 'subtract an origin'],
-        ),
     ],
-    ids=['actions', 'jump', 'precision'],
+    ids=['actions', 'jump'],
 )
 def test_suspicious_content_is_logged(tmp_path, arrays, told, caplog):
     with caplog.at_level(logging.WARNING):

@@ -2,9 +2,14 @@
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from metagcttt_core import FilterConfig, TrajectoryFilter
+from metagcttt_core.retrieval import spatial_index
 from metagcttt_core.retrieval.spatial_index import SpatialIndex
+from metagcttt_core.retrieval.variants import smallest_per_episode
 import numpy as np
 import pytest
+
+from tests.core.builders import random_dataset
 
 
 def scan(observations, dims, scale, point, radius, *, strict=False):
@@ -51,6 +56,51 @@ def test_ball_equals_a_scan(seed, dims, spread, offset, radius, cell, scaled, st
         assert rows.tolist() == expected_rows.tolist()
         np.testing.assert_allclose(distances, expected, rtol=1e-12)
         assert rows.dtype == np.int64
+
+
+@given(
+    seed=st.integers(0, 10_000),
+    dims=st.sampled_from([(0,), (1, 0), (0, 1, 2)]),
+    rows=st.sampled_from([1, 60, 2000]),  # the kernel reads 512 at a time
+    radius=st.sampled_from([0.1, 1.0, 50.0]),
+    ties=st.booleans(),
+    from_some_row=st.booleans(),
+)
+def test_nearest_per_episode_is_the_smallest_of_the_ball(
+    seed, dims, rows, radius, ties, from_some_row
+):
+    rng = np.random.default_rng(seed)
+    observations = rng.normal(size=(rows, 3)).astype(np.float32)
+    if ties:
+        observations = np.round(observations)
+    episodes = np.sort(rng.integers(7, size=rows))
+    scale = tuple(rng.uniform(0.2, 3, size=len(dims)))
+    index = SpatialIndex(observations, dims, scale, 0.5, episodes)
+    first_usable = rng.integers(rows, size=episodes[-1] + 1) if from_some_row else None
+    point = rng.normal(size=len(dims))
+    found = index.nearest_per_episode(point, radius, first_usable)
+    if len(dims) > 2:
+        assert found is None
+        return
+    near, distances = index.ball(point, radius)
+    if first_usable is not None:
+        usable = near >= first_usable[episodes[near]]
+        near, distances = near[usable], distances[usable]
+    for own, expected in zip(
+        found, smallest_per_episode(episodes[near], near, distances), strict=True
+    ):
+        assert own.tolist() == expected.tolist()
+
+
+@pytest.mark.parametrize('variant', ['paper', 'relevance_only', 'score_only'])
+def test_filters_without_a_compiler_select_the_same(variant, monkeypatch):
+    dataset = random_dataset([40] * 8, seed=3)
+    tasks = dataset.observations[np.random.default_rng(0).integers(320, size=(20, 2))]
+    config = FilterConfig(variant=variant, epsilon=0.7)
+    found = [TrajectoryFilter(dataset, config).query(*task) for task in tasks]
+    monkeypatch.setattr(spatial_index, 'kernels_if_any', lambda: None)
+    assert [TrajectoryFilter(dataset, config).query(*task) for task in tasks] == found
+    assert any(found)
 
 
 @pytest.mark.parametrize('strict', [False, True])

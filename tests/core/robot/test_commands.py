@@ -15,7 +15,7 @@ from metagcttt_core.robot.commands import (
 import numpy as np
 import pytest
 
-from tests.core.robot.messages import ARM, contract, joints, SECOND
+from tests.core.robot.messages import ARM, contract, DRIVE, joints, SECOND
 
 STEP = SECOND // 10
 NOTHING_OBSERVED = np.zeros(4)
@@ -83,6 +83,16 @@ def test_fallbacks():
     assert sender.fall_back('nothing', 6 * STEP) is None
     assert sender.fall_back('zeros', 7 * STEP).tolist() == [0.0, 0.0]  # at once
     assert sender.command([1.0, 1.0], NOTHING_OBSERVED, 8 * STEP)[0] == pytest.approx(0.1)
+
+
+def test_stop_within_rates_is_gradual():
+    sender = commander(
+        DRIVE.replace('fallback: zeros', 'fallback: zeros\n    stops_within_rates: true')
+    )
+    for step in range(5):
+        sender.command([1.0, 1.0], NOTHING_OBSERVED, step * STEP)
+    speeds = [sender.fall_back('zeros', step * STEP)[0] for step in range(5, 11)]
+    np.testing.assert_allclose(speeds, [0.4, 0.3, 0.2, 0.1, 0, 0], atol=1e-9)
 
 
 def test_command_is_written_and_read_back():

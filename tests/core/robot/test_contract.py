@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from metagcttt_core.robot import Contract, ContractError, load_contract
+from metagcttt_core.robot import Contract, ContractError, identity_fault, load_contract
 import pytest
 
 from tests.core.robot.messages import ARM, contract, DRIVE, ROBOTS
@@ -60,7 +60,7 @@ def test_columns_are_named_in_order():
         ('max_rate: 1.0', 'max_rate: 0', 18, 'max_rate must be positive'),
         ('stamp: header', 'stamp: header\n    timeout_s: -1', 10, 'timeout_s: Input should be gr'),
         ('fallback: zeros', 'fallback: zeros\n    timeout_s: 0.05', 2, 'shorter than a period'),
-        ('transform: heading', 'transform: heading, size: 3', 13, 'a heading has no joints'),
+        ('transform: heading', 'transform: heading, size: 3', 13, 'takes no joints'),
     ],
 )
 def test_mistakes_are_named_with_their_line(tmp_path: Path, old, new, line, message):
@@ -112,9 +112,64 @@ def test_files_that_hold_no_contract_are_refused(tmp_path: Path, content, messag
         ('measured: position', 'measured: effort', 'no observed value is named b.effort'),
         ('joints: [b, a]', 'size: 2', 'measured takes joints'),
         ('high: [3, 2]', 'high: [3, 2, 1]', 'high needs 1 or 2 numbers, got 3'),
+        ('fault: hold', 'fault: zeros', 'fallback fault: zeros would drive the positions of data'),
+        ('[a, b]}', '[a, b], clamp: [1, 0]}', 'clamp takes a lower and a higher bound'),
+        ('[a, b]}', '[a, b], scale: 0}', 'scale must not be 0'),
     ],
 )
 def test_joints_that_do_not_fit_are_refused(old, new, message):
     assert old in ARM
     with pytest.raises(ValueError, match=message):
         contract(ARM.replace(old, new, 1))
+
+
+@pytest.mark.parametrize(
+    ('text', 'section', 'message'),
+    [
+        (DRIVE, 'goal: {tolerance: {z: 1}}', r'no value z to tolerate .*distance, x, y, yaw'),
+        (DRIVE, 'goal: {tolerance: {distance: 0}}', 'greater than 0'),
+        (DRIVE, 'goal: {tolerance: {}}', 'at least 1'),
+        (DRIVE, 'goal: {tolerance: {x: 1}, yaw: x}', r'yaw x is no observed heading .*yaw'),
+        (DRIVE, 'goal: {tolerance: {x: 1}, yaw: yaw}', 'yaw needs a tolerance'),
+        (ARM, 'goal: {tolerance: {distance: 1}}', 'no value distance'),
+        (ARM, 'goal: {tolerance: {position: 1}, map: {}}', 'a map takes a contract with a pos'),
+        (ARM, 'retrieval: {epsilon: 1}', 'retrieval needs values'),
+        (ARM, 'retrieval: {values: [c], epsilon: 1}', 'no observed value is named c'),
+    ],
+)
+def test_goals_and_distances_are_about_observed_values(text, section, message):
+    with pytest.raises(ValueError, match=message):
+        contract(f'{text}{section}\n')
+
+
+def test_zeros_go_to_positions_only_when_that_is_said():
+    said = 'fallback: zeros\n    zero_is_a_safe_position: true\n'
+    assert contract(ARM.partition('fallback')[0] + said).act[0].fallback.fault == 'zeros'
+
+
+def test_identity_is_what_the_numbers_mean():
+    fingerprint = contract().identity['fingerprint']
+    for old, new in (('robot: cart', 'robot: car'), ('topic: odom', 'topic: /a/odom')):
+        other = contract(DRIVE.replace(old, new)).identity
+        assert identity_fault('it', other, contract().identity) == ''
+    for old, new, difference in (
+        ('rate_hz: 10', 'rate_hz: 20', 'rate_hz 20.0, not 10.0'),
+        ('high: 2', 'high: 3', 'actions 1 is name angular.z low -2.0 high 3.0, not name'),
+        ('origin: 5000000', 'origin: 0', 'observations 1 is name y'),
+        ('      - {field: angular.z, low: -2, high: 2}\n', '', '1 actions, not 2'),
+    ):
+        other = contract(DRIVE.replace(old, new).replace('robot: cart', 'robot: car')).identity
+        fault = identity_fault('the data d.npz', other, contract().identity)
+        assert fault.startswith(
+            f'the data d.npz was made for car (contract {other["fingerprint"]}'
+        )
+        assert f'not for cart (contract {fingerprint})' in fault
+        assert difference in fault
+    assert identity_fault('it', None, contract().identity) == ''
+
+
+def test_distances_use_the_position_unless_values_are_named():
+    assert contract().position_dims == (0, 1)
+    assert contract(ARM).position_dims == ()
+    named = 'retrieval: {values: [b.position], epsilon: 1}\n'
+    assert contract(ARM + named).position_dims == (1,)

@@ -6,7 +6,7 @@ from metagcttt_core.robot import Observer
 import numpy as np
 import pytest
 
-from tests.core.robot.messages import ARM, contract, joints, odometry, SECOND
+from tests.core.robot.messages import ARM, contract, DRIVE, joints, odometry, SECOND
 
 STEP = SECOND // 10
 
@@ -131,3 +131,32 @@ def test_joints_that_do_not_fit_are_refused(message, reason):
     observer = Observer(contract(ARM))
     assert reason in observer.take('joint_states', message, 0)
     assert observer.sample(0) is None
+
+
+@pytest.mark.parametrize(('align', 'usable_s'), [('drop', 0.1), ('asof', 0.5), ('hold', 3600.0)])
+def test_alignment_decides_how_old_a_message_may_be(align, usable_s):
+    text = DRIVE.replace('stamp: header', f'stamp: header\n    align: {align}')
+    observer = Observer(contract(text))
+    observer.take('odom', odometry(0), 0)
+    assert observer.sample(round(usable_s * SECOND)) is not None
+    assert (observer.sample(round(usable_s * SECOND) + 1) is None) == (align != 'hold')
+    # A held message may have been sent long before this reader came; others have to be fresh.
+    refusal = observer.take('odom', odometry(SECOND), 9 * SECOND)
+    assert ('late, or another clock' in refusal) == (align != 'hold')
+
+
+@pytest.mark.parametrize(
+    ('how', 'expected'),
+    [
+        ('scale: 0.5', [2.0]),
+        ('clamp: [-1, 1]', [1.0]),
+        ('transform: wrap', [4.0 - 2 * np.pi]),
+        ('transform: angle', [np.cos(4.0), np.sin(4.0)]),
+        ('origin: 1, scale: 2, transform: wrap', [6.0 - 2 * np.pi]),
+    ],
+)
+def test_values_are_transformed(how, expected):
+    text = DRIVE.replace('name: x, max_rate: 2.0', f'name: p, {how}').replace('[x, y]', '[y, y]')
+    observer = Observer(contract(text))
+    assert observer.take('odom', odometry(0, x=4.0), 0) == ''
+    np.testing.assert_allclose(observer.sample(0)[: len(expected)], expected, atol=1e-12)

@@ -186,6 +186,7 @@ def test_diagnostics_have_figures(rig: FaultRig) -> None:
     assert float(figures['latency_p99_ms']) >= float(figures['latency_median_ms']) > 0
     assert float(figures['adapt_last_ms']) > 0
     assert figures['adaptations_pending'] == '0'
+    assert figures['adapt_engine'] == 'kernels'
 
 
 @pytest.mark.parametrize(

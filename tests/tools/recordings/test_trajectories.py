@@ -7,6 +7,9 @@ from metagcttt_core.data import DatasetError
 from metagcttt_tools.recordings.trajectories import ACTION, join_datasets, read_recordings, STATE
 import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
 
 STATE_TEXT = (
     'std_msgs/Header header\nuint32 episode_id\nuint32 step\nfloat64[] observation\n'
@@ -307,3 +310,55 @@ def test_datasets_are_joined_trajectory_by_trajectory(bag) -> None:
     dataset, _ = read_recordings([bag.close()])
     joined = join_datasets([dataset, dataset])
     assert joined.episode_ends.tolist() == [3, 7]
+
+
+def same_bag(source: Path, path: Path, plugin: StoragePlugin, compress: bool = False) -> Path:
+    """A recording as another program would keep it, in a folder."""
+    writer = Writer2(path, version=9, storage_plugin=plugin)
+    if compress:
+        writer.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
+    with AnyReader([source]) as reader, writer:
+        topics = {
+            each.id: writer.add_connection(each.topic, each.msgtype, typestore=reader.typestore)
+            for each in reader.connections
+        }
+        for connection, time_ns, data in reader.messages():
+            writer.write(topics[connection.id], time_ns, data)
+    return path
+
+
+@pytest.mark.parametrize('form', ['mcap', 'sqlite3', 'compressed', 'bare db3', 'no metadata'])
+def test_bag_in_any_form_is_the_same_recording(bag, tmp_path: Path, form: str) -> None:
+    bag.walk(range(0, 4))
+    bag.clock_ns += 10**12  # a jump
+    bag.walk(range(4, 8))
+    expected, told = read_recordings([bag.close()])
+    plugin = StoragePlugin.SQLITE3 if form in ('sqlite3', 'bare db3') else StoragePlugin.MCAP
+    path = same_bag(bag.path, tmp_path / 'folder', plugin, compress=form == 'compressed')
+    if form == 'bare db3':
+        [path] = path.glob('*.db3')
+    if form == 'no metadata':
+        (path / 'metadata.yaml').unlink()
+    dataset, summary = read_recordings([path])
+    np.testing.assert_array_equal(dataset.observations, expected.observations)
+    np.testing.assert_array_equal(dataset.actions, expected.actions)
+    np.testing.assert_array_equal(dataset.episode_starts, expected.episode_starts)
+    assert dataset.num_episodes == 2
+    assert summary.dropped == told.dropped
+
+
+@pytest.mark.parametrize(
+    ('content', 'reason'),
+    [('', 'cannot be read'), ('a: [', 'cannot be read'), ('[1]', 'cannot be read')],
+)
+def test_folder_with_false_metadata_is_refused(tmp_path: Path, content: str, reason: str) -> None:
+    (tmp_path / 'metadata.yaml').write_text(content, encoding='utf-8')
+    with pytest.raises(DatasetError, match=f'metadata.yaml: {reason}'):
+        read_recordings([tmp_path])
+
+
+def test_folder_or_file_that_is_no_bag_is_refused(tmp_path: Path) -> None:
+    (tmp_path / 'a.db3').write_bytes(b'SQLite format 3\x00 and nothing')
+    for path in (tmp_path, tmp_path / 'a.db3', tmp_path / 'missing.db3'):
+        with pytest.raises(DatasetError, match=path.name):
+            read_recordings([path])

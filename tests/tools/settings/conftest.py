@@ -8,7 +8,7 @@ from metagcttt_core import save_checkpoint, TrajectoryDataset
 from metagcttt_core.training.config import PretrainConfig
 from metagcttt_core.training.pretrain import pretrain
 import pytest
-from tests.core.builders import DATA, maze_walks, tiny_agent
+from tests.core.builders import DATA, maze_walks, random_dataset, tiny_agent
 from tests.core.robot.messages import DRIVE
 
 
@@ -50,4 +50,14 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ('nets_gcbc_pm', 'nets_gcbc_ant', 'nets_gciql_pm'):
         shutil.copy(DATA / f'{name}.npz', folder)
     (folder / 'cart.yaml').write_text(DRIVE)
+    (folder / 'table.csv').write_text('run,x,v\n1,1,0.1\n1,2,0.2\n2,3,0.3\n2,4,0.4\n')
+    for name, observed in (('by-run', 'x'), ('by-v', 'v')):
+        (folder / f'{name}.yaml').write_text(
+            f'{{observations: [{observed}], actions: [v], cut: {{episode: run}}}}'
+        )
+    for name, column in (('state', 'observation.state'), ('action', 'action')):
+        (folder / f'{name}.yaml').write_text(
+            f'{{observations: [{column}], actions: [next.reward]}}'
+        )
+    random_dataset(obs_dim=4).save(folder / 'cart.npz')
     return folder

@@ -2,7 +2,7 @@
 
 from contextlib import nullcontext
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from unittest import mock
 
 from metagcttt_tools import (
@@ -20,12 +20,13 @@ from metagcttt_tools.common import plots
 from metagcttt_tools.controller import humanoid
 from metagcttt_tools.recordings import goal_views, trajectories
 from metagcttt_tools.robots import bag, episodes, report
+from metagcttt_tools.tables import lerobot, lerobot_writer
 import numpy as np
 import ogbench
 import pytest
 from sim_bridge.controllers.direction import BUNDLED
 from sim_bridge.controllers.walk import GoalRun
-from tests.core.builders import random_dataset
+from tests.core.builders import DATA, random_dataset
 from tests.core.robot.messages import contract
 from tests.tools.settings.walk import Proof, Seen, ShortSimulator, Walk, walks_through
 import torch.utils.tensorboard
@@ -52,6 +53,7 @@ GENERATE = Walk(
         'rows_per_episode': 9,
         'noise': 0.1,
         'to_goal': True,
+        'standing': Proof(True, refused='only humanoids have a standing start'),
         'seed': 1,
         'output': 'elsewhere.npz',
         'processes': 2,
@@ -149,6 +151,60 @@ IMPORT_BAGS = Walk(
 )
 
 
+IMPORT_TABLE = Walk(
+    'import-table',
+    {'tables': ['@table.csv'], 'columns': '@by-run.yaml'},
+    {
+        'tables': ['@table.csv', '@table.csv'],
+        'columns': '@by-v.yaml',
+        'limits_from_data': True,
+        'out': 'elsewhere.npz',
+        'overwrite': Proof(True, again=True),
+    },
+)
+PUSHT = str(DATA / 'lerobot_pusht')
+IMPORT_LEROBOT = Walk(
+    'import-lerobot',
+    {'folder': PUSHT, 'columns': '@state.yaml'},
+    {
+        'folder': Proof('nowhere', refused='no LeRobot dataset there'),
+        'columns': '@action.yaml',
+        'contract': Proof(
+            '@cart.yaml', {'columns': None, 'limits_from_data': True}, refused="no value 'x'"
+        ),
+        'limits_from_data': True,
+        'trust_rows': True,
+        'out': 'elsewhere.npz',
+        'overwrite': Proof(True, again=True),
+    },
+    lambda patch, seen: note_calls(patch, seen, lerobot, 'read_lerobot'),
+)
+EXPORT_LEROBOT = Walk(
+    'export-lerobot',
+    {'data': '@cart.npz', 'fps': 5},
+    {
+        'data': '@walks.npz',
+        'contract': '@cart.yaml',
+        'fps': 7,
+        'task': Proof('push'),
+        'rows_per_file': 3,
+        'out': 'elsewhere',
+    },
+    lambda patch, seen: note_calls(patch, seen, lerobot_writer, 'write_lerobot'),
+)
+
+
+def note_calls(patch: pytest.MonkeyPatch, seen: Seen, module: ModuleType, name: str) -> None:
+    """Note the settings that a function is called with, and call it."""
+    function = getattr(module, name)
+
+    def noting(*given, **named):
+        seen.append(named)
+        return function(*given, **named)
+
+    patch.setattr(module, name, noting)
+
+
 def watch_inspection(patch: pytest.MonkeyPatch, seen: Seen) -> None:
     patch.setattr(inspect_data, 'inspect', lambda data: seen.append(data.fingerprint))
     patch.setattr(inspect_data, 'describe', lambda found, *names: seen.append(names))
@@ -162,6 +218,7 @@ INSPECT = Walk(
     {
         'data': '@half.npz',
         'contract': Proof('@cart.yaml', refused='the contract of cart has 4 and 2'),
+        'columns': Proof('@action.yaml', {'data': PUSHT}),
         'coverage': [1, 0],
         'out': 'elsewhere.png',
     },
@@ -343,10 +400,15 @@ def watch_measuring(patch: pytest.MonkeyPatch, seen: Seen) -> None:
 
     def walk_to_goal(follower, maze, *given):
         seen.append(('goal', maze.spec.name, given))
-        return GoalRun(reached=True, fallen=False, duration_s=1.0)
+        return GoalRun(reached=True, falls=0, duration_s=1.0)
+
+    def stands_up(follower, maze, *given):
+        seen.append(('rise', maze.spec.name, given))
+        return True
 
     patch.setattr(controller_measure, 'walk_along', walk_along)
     patch.setattr(controller_measure, 'walk_to_goal', walk_to_goal)
+    patch.setattr(controller_measure, 'stands_up', stands_up)
     patch.setattr(controller_measure, 'OGBenchMaze', ShortSimulator)
     patch.setattr(controller_measure, 'film', lambda _, *given: seen.append(given))
     patch.setattr(plots, 'controller_picture', lambda walks: None)
@@ -362,6 +424,7 @@ MEASURE = Walk(
         'duration_s': 1.0,
         'repeats': 2,
         'walks': 3,
+        'drops': Proof(2, given={'controller': str(BUNDLED / 'humanoid')}),
         'mazes': ['large'],
         'episodes_per_task': 2,
         'action_noise': 0.4,
@@ -377,6 +440,9 @@ WALKS = (
     DOWNLOAD,
     IMPORT,
     IMPORT_BAGS,
+    IMPORT_TABLE,
+    IMPORT_LEROBOT,
+    EXPORT_LEROBOT,
     CONTRACT_CHECK,
     INSPECT,
     CONVERT,

@@ -179,14 +179,23 @@ def random_batch(agent: Agent, size: int) -> TensorBatch:
 
 
 def median_ms(ways: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
-    """Median milliseconds of each call; they take turns, so that a slow spell meets all."""
+    """Median milliseconds of each call; see `times_ms`."""
+    return {name: float(np.median(taken)) for name, taken in times_ms(ways, repeats).items()}
+
+
+def times_ms(
+    ways: dict[str, Callable[[], Any]],
+    repeats: int,
+    clock: Callable[[], float] = time.perf_counter,
+) -> dict[str, list[float]]:
+    """Milliseconds of each call; they take turns, so that a slow spell meets all."""
     times: dict[str, list[float]] = {name: [] for name in ways}
     for call in ways.values():
         for _ in range(3):
             call()
     for _ in range(repeats):
         for name, call in ways.items():
-            began = time.perf_counter()
+            began = clock()
             call()
-            times[name].append(1e3 * (time.perf_counter() - began))
-    return {name: float(np.median(values)) for name, values in times.items()}
+            times[name].append(1e3 * (clock() - began))
+    return times

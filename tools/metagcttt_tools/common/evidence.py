@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from metagcttt_core.config import error_lines, Settings
+from metagcttt_core.config.yaml_file import read_yaml
 from pydantic import Field, TypeAdapter, ValidationError
 import yaml
 
@@ -57,7 +58,7 @@ def read_evidence(path: Path) -> Evidence:
         ValueError: If the file is missing or malformed; names it.
     """
     try:
-        return TypeAdapter(Evidence).validate_python(yaml.safe_load(path.read_text('utf-8')))
+        return TypeAdapter(Evidence).validate_python(read_yaml(path)[1])
     except (FileNotFoundError, yaml.YAMLError) as error:
         raise ValueError(f'{path}: {error}') from error
     except ValidationError as error:

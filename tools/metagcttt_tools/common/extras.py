@@ -12,6 +12,7 @@ EXTRAS = {
     'mcap_ros2': 'recordings',
     'mujoco': 'mazes',
     'ogbench': 'mazes',
+    'pyarrow': 'tables',
     'rosbags': 'recordings',
     'scipy': 'plots',
     'tensorboard': 'plots',

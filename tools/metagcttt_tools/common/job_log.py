@@ -4,6 +4,16 @@ import json
 from pathlib import Path
 from typing import Any, cast, Generic, TypeVar
 
+from metagcttt_core.config import error_lines
+from metagcttt_core.files import read_json_lines
+from pydantic import BaseModel, ValidationError
+
+
+class _Entry(BaseModel):
+    job: tuple[str | int | float, ...]
+    result: float
+
+
 Job = TypeVar('Job', bound=tuple[Any, ...])
 
 
@@ -43,16 +53,22 @@ class JobLog(Generic[Job]):
 
     @staticmethod
     def settings(path: Path) -> dict[str, Any]:
-        """The settings that the log in `path` begins with."""
-        with path.open(encoding='utf-8') as file:
-            return json.loads(file.readline())['settings']
+        """The settings that the log in `path` begins with.
+
+        Raises:
+            ValueError: If it does not; names the file.
+        """
+        first, *_ = read_json_lines(path) or [{}]
+        settings = first.get('settings')
+        if not isinstance(settings, dict) or not isinstance(settings.get('decisive'), dict):
+            raise ValueError(f'{path}: does not begin with settings: remove it to start anew')
+        return settings
 
     def _write(self, *lines: dict[str, Any]) -> None:
         self._file.writelines(json.dumps(line) + '\n' for line in lines)
         self._file.flush()
 
     def _read(self, settings: dict[str, Any]) -> None:
-        _, *lines = self._path.read_text(encoding='utf-8').splitlines(keepends=True)
         kept, asked = self.settings(self._path)['decisive'], settings['decisive']
         for name in sorted(kept.keys() | asked.keys()):
             if kept.get(name) != asked.get(name):
@@ -60,7 +76,10 @@ class JobLog(Generic[Job]):
                     f'{self._path}: cannot resume, {name} was {kept.get(name)!r} '
                     f'and is now {asked.get(name)!r}'
                 )
-        for line in lines:
-            if line.endswith('\n'):  # a kill can leave the last line unfinished
-                entry = json.loads(line)
-                self.finished[cast(Job, tuple(entry['job']))] = entry['result']
+        for number, line in enumerate(read_json_lines(self._path)[1:], 2):
+            try:
+                entry = _Entry.model_validate(line)
+            except ValidationError as error:
+                lines = '; '.join(error_lines(error))
+                raise ValueError(f'{self._path}:{number}: {lines}') from error
+            self.finished[cast(Job, entry.job)] = entry.result

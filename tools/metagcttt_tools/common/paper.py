@@ -11,7 +11,7 @@ from functools import cache
 from importlib.resources import files
 from typing import Any, NamedTuple
 
-import yaml
+from metagcttt_core.config.yaml_file import read_yaml
 
 _OUTER_STEPS, _SNAPSHOT_EVERY = 50_000, 5_000
 _HORIZON = 100
@@ -92,8 +92,7 @@ def table3() -> list[Row]:
 
 @cache
 def _read() -> dict[str, Any]:
-    text = (files('metagcttt_tools.common') / 'paper.yaml').read_text(encoding='utf-8')
-    return yaml.safe_load(text)
+    return read_yaml(files('metagcttt_tools.common') / 'paper.yaml')[1]
 
 
 def _preset(row: Row, environment: str, alpha: float, discount: float) -> dict[str, Any]:

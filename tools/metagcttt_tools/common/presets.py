@@ -5,7 +5,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import yaml
+from metagcttt_core.config.yaml_file import read_yaml
 
 from metagcttt_tools.common.paper import paper_presets
 
@@ -37,7 +37,7 @@ def load_preset(name_or_path: str | Path) -> dict[str, Any]:
             .yml).
 
     Raises:
-        ValueError: If there is no such preset or file, or it does not hold a mapping.
+        ValueError: If there is no such preset or file, or it holds no mapping of settings.
     """
     if str(name_or_path).endswith(('.yaml', '.yml')):
         source: Any = Path(name_or_path)
@@ -55,12 +55,4 @@ def load_preset(name_or_path: str | Path) -> dict[str, Any]:
                 'and those of metagcttt presets)'
             )
         source = presets[str(name_or_path)]
-    try:
-        values = yaml.safe_load(source.read_text(encoding='utf-8'))
-    except yaml.YAMLError as error:
-        raise ValueError(f'preset {name_or_path} is not valid YAML: {error}') from error
-    if not isinstance(values, dict):
-        raise ValueError(
-            f'preset {name_or_path} must hold a mapping of settings, got {type(values).__name__}'
-        )
-    return values
+    return read_yaml(source)[1]

@@ -4,12 +4,32 @@ from abc import ABC, abstractmethod
 import os
 from pathlib import Path
 import platform
-from typing import Any
+from typing import Annotated, Any
 
 from metagcttt_core.config import Settings
 from metagcttt_core.files import write_json
+from pydantic import BaseModel, Field
 
 from metagcttt_tools.common.session import provenance
+
+
+class Point(BaseModel):
+    """Success with one budget, in a file of results."""
+
+    budget: int = Field(ge=0)
+    success: float = Field(ge=0, le=1, allow_inf_nan=False)
+
+
+class PolicyResult(BaseModel):
+    """Success of one policy, in a file of results."""
+
+    curve: Annotated[tuple[Point, ...], Field(min_length=1)]
+
+
+class Results(BaseModel):
+    """What is read again of the file that `metagcttt evaluate` writes."""
+
+    results: tuple[PolicyResult, ...]
 
 
 class Benchmark(Settings, ABC):

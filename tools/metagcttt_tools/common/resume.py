@@ -1,11 +1,11 @@
 """Resuming: `--resume` alone continues a run by the settings that its folder keeps."""
 
 from collections.abc import Callable, Mapping
-import json
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 from metagcttt_core.config import error_lines, Settings
+from metagcttt_core.files import read_json
 from pydantic import Field, ValidationError
 
 
@@ -43,9 +43,12 @@ def kept_in(file: Path) -> tuple[Path, Mapping[str, Any]] | None:
     if not file.is_file():
         return None
     try:
-        return file, json.loads(file.read_text(encoding='utf-8'))['settings']
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f'{file}: holds no settings to continue with') from error
+        settings = read_json(file)['settings']
+    except (ValueError, KeyError) as error:
+        raise ValueError(f'{file}: holds no settings to continue with ({error})') from error
+    if not isinstance(settings, dict):
+        raise ValueError(f'{file}: holds no settings to continue with (got {settings!r})')
+    return file, settings
 
 
 ResumableT = TypeVar('ResumableT', bound=Resumable)

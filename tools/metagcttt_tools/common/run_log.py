@@ -10,7 +10,7 @@ import sys
 import time
 from typing import Any, Self, TYPE_CHECKING
 
-from metagcttt_core.files import atomic_write
+from metagcttt_core.files import atomic_write, read_json_lines
 import numpy as np
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ class RunLog:
         path = folder / METRICS
         self.records: list[dict[str, Any]] = []
         if first_step > 0 and path.exists():
-            self.records = [line for line in read_metrics(path) if line['step'] <= first_step]
+            self.records = [line for line in read_json_lines(path) if line['step'] <= first_step]
         with atomic_write(path) as file:
             file.writelines((json.dumps(record) + '\n').encode() for record in self.records)
         self._file = path.open('a', encoding='utf-8')
@@ -109,9 +109,3 @@ def _tensorboard(folder: Path, first_step: int) -> SummaryWriter | None:
     from torch.utils.tensorboard import SummaryWriter
 
     return SummaryWriter(str(folder), purge_step=first_step)
-
-
-def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """The lines of a `metrics.jsonl`, in order; a last one cut short by a crash is left out."""
-    *lines, _ = path.read_text(encoding='utf-8').split('\n')
-    return [json.loads(line) for line in lines]

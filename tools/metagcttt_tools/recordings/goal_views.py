@@ -10,7 +10,8 @@ from metagcttt_core.data import DatasetError
 import numpy as np
 from sim_bridge.maze_map import MazeMap
 
-from metagcttt_tools.recordings.mcap import read_messages, Recorded
+from metagcttt_tools.recordings.bags import read_bag
+from metagcttt_tools.recordings.mcap import Recorded
 
 _GRID = 'nav_msgs/msg/OccupancyGrid'
 _STATE = 'metagcttt_interfaces/msg/MazeState'
@@ -45,14 +46,14 @@ def read_goal_views(
     """The maze and the goals of one robot, in order.
 
     Args:
-        recording: File of recorder_node.
+        recording: File or folder of recorder_node.
         dataset: What the robot adapted on; without it nothing retrieved is shown.
         robot: Its namespace, such as `/robot1`.
 
     Raises:
         DatasetError: If the file cannot be read or has no map, state or goal of that robot.
     """
-    content = read_messages(recording, (_GRID, _STATE, _GOAL, _REPORT, _EVENT))
+    content = read_bag(recording, (_GRID, _STATE, _GOAL, _REPORT, _EVENT))
     by_type: dict[str, list[Any]] = {name: [] for name in (_GRID, _REPORT, _EVENT)}
     for recorded in content.messages:
         if recorded.topic.rpartition('/')[0] == robot and recorded.type_name in by_type:

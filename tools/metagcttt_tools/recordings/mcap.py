@@ -70,7 +70,7 @@ def jumps(before_ns: int, after_ns: int) -> bool:
     return not -BACK_NS <= after_ns - before_ns <= SILENCE_NS
 
 
-class _Clocks:
+class Clocks:
     """Numbers the stretches of a file within which its clocks run on.
 
     A recorder appends messages as it receives them, and receives those of a topic about as they
@@ -78,6 +78,7 @@ class _Clocks:
     """
 
     def __init__(self) -> None:
+        """Start before the first message."""
         self.begin_ns = self.end_ns = 0
         self.num_stretches = 1
         self._published_ns: dict[int, int] = {}
@@ -135,7 +136,7 @@ def read_messages(path: Path, type_names: Collection[str]) -> RecordedMessages:
     found: list[Recorded] = []
     topics: dict[str, str] = {}
     complete = False
-    clocks = _Clocks()
+    clocks = Clocks()
     try:
         with path.open('rb') as file:
             reader = StreamReader(

@@ -1,16 +1,17 @@
 """Trajectories from recordings of deployed robots, so that what they do becomes data."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.data.errors import DatasetError
 import numpy as np
 
-from metagcttt_tools.recordings.mcap import read_messages, Recorded, RecordedMessages
+from metagcttt_tools.recordings.bags import read_bag
+from metagcttt_tools.recordings.mcap import Recorded, RecordedMessages
 from metagcttt_tools.recordings.robot import MISFITS, OTHER_STATE, Robot, usual_period_s
 
 STATE = 'metagcttt_interfaces/msg/MazeState'
@@ -50,7 +51,8 @@ def read_recordings(
     the robot.
 
     Args:
-        paths: Files of recorder_node or `ros2 bag record`; those of one split recording in order.
+        paths: Files or folders of recorder_node or `ros2 bag record`; the files of one split
+            recording in order.
         keep_idle: Keep steps in which the robot had no goal.
         refuse_gaps: Fail where a trajectory would be cut, but for idle steps.
 
@@ -64,7 +66,7 @@ def read_recordings(
     """
     if not paths:
         raise DatasetError('no recordings were given')
-    contents = [read_messages(path, (STATE, ACTION)) for path in paths]
+    contents = [read_bag(path, (STATE, ACTION)) for path in paths]
     by_robot = _by_robot(contents)
     dropped: Counter[str] = Counter()
     trajectories: list[tuple[np.ndarray, np.ndarray]] = []
@@ -133,8 +135,14 @@ def _trajectories(
     return robot.trajectories
 
 
-def join_datasets(datasets: Iterable[TrajectoryDataset]) -> TrajectoryDataset:
+def join_datasets(
+    datasets: Iterable[TrajectoryDataset], *, contract: Mapping[str, Any] | None = None
+) -> TrajectoryDataset:
     """All trajectories of several datasets, without their extras.
+
+    Args:
+        datasets: The datasets.
+        contract: Identity of the contract that all of them satisfy, if any.
 
     Raises:
         DatasetError: If observations or actions differ in length.
@@ -142,14 +150,17 @@ def join_datasets(datasets: Iterable[TrajectoryDataset]) -> TrajectoryDataset:
     datasets = list(datasets)
     return _join(
         [
-            (dataset.observations[start : end + 1], dataset.actions[start : end + 1])
+            (dataset.states(slice(start, end + 1)), dataset.actions[start : end + 1])
             for dataset in datasets
             for start, end in zip(dataset.episode_starts, dataset.episode_ends, strict=True)
-        ]
+        ],
+        contract,
     )
 
 
-def _join(trajectories: list[tuple[np.ndarray, np.ndarray]]) -> TrajectoryDataset:
+def _join(
+    trajectories: list[tuple[np.ndarray, np.ndarray]], contract: Mapping[str, Any] | None = None
+) -> TrajectoryDataset:
     sizes = sorted({(o.shape[1], a.shape[1]) for o, a in trajectories})
     if len(sizes) > 1:
         raise DatasetError(
@@ -161,6 +172,7 @@ def _join(trajectories: list[tuple[np.ndarray, np.ndarray]]) -> TrajectoryDatase
         np.concatenate([o for o, _ in trajectories]),
         np.concatenate([a for _, a in trajectories]),
         np.concatenate(terminals),
+        contract=contract,
     )
 
 

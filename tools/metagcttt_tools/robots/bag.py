@@ -4,18 +4,16 @@ from bisect import bisect_right
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-import struct
 from typing import Any, NamedTuple
 
-from metagcttt_core.data import DatasetError
 from metagcttt_core.robot import Contract
 from metagcttt_core.robot.types import FieldType
-from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Nodetype
-from rosbags.rosbag2 import ReaderError
-from rosbags.serde import SerdeError
 from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
+
+from metagcttt_tools.common.bags import open_any_bag, reading
 
 CLOCK = '/clock'
 
@@ -49,8 +47,9 @@ class Bag:
         definitions: The message types that the bag defines.
     """
 
-    def __init__(self, reader: AnyReader, contract: Contract, namespace: str) -> None:
+    def __init__(self, path: Path, reader: AnyReader, contract: Contract, namespace: str) -> None:
         """Find the topics of a contract in an open bag."""
+        self._path = path
         topics = [topic.topic for topic in contract.topics]
         names = {resolved(topic, namespace): topic for topic in topics}
         self._reader = reader
@@ -73,14 +72,15 @@ class Bag:
         connections = [connection for _, connection in self._connections.values()]
         if not connections:
             return
-        clock = self._clock()
-        for connection, received_ns, data in self._reader.messages(connections):
-            if clock:
-                if received_ns < clock[0][0]:
-                    continue
-                received_ns = _simulated(clock, received_ns)
-            message = self._reader.deserialize(data, connection.msgtype)
-            yield Recorded(self._names[connection.topic], message, received_ns)
+        with reading(self._path):
+            clock = self._clock()
+            for connection, received_ns, data in self._reader.messages(connections):
+                if clock:
+                    if received_ns < clock[0][0]:
+                        continue
+                    received_ns = _simulated(clock, received_ns)
+                message = self._reader.deserialize(data, connection.msgtype)
+                yield Recorded(self._names[connection.topic], message, received_ns)
 
     def _clock(self) -> list[tuple[int, int]]:
         """Recorded and simulated times of `/clock`, nanoseconds; empty without it."""
@@ -123,20 +123,10 @@ def open_bag(path: Path, contract: Contract, namespace: str = '') -> Iterator[Ba
     Raises:
         DatasetError: If the bag is missing or damaged, also while it is read.
     """
-    try:
-        humble = get_typestore(Stores.ROS2_HUMBLE)
-        with AnyReader([path], default_typestore=humble) as reader:
-            yield Bag(reader, contract, namespace)
-    except DatasetError as error:
-        raise DatasetError(f'{path}: {error}') from error
-    except FileNotFoundError as error:
-        raise DatasetError(f'{path}: no such bag ({error})') from error
-    # The packages below raise any of these for damaged files and messages.
-    except (
-        *(AnyReaderError, ReaderError, SerdeError, OSError, struct.error, RuntimeError),
-        *(AssertionError, LookupError, OverflowError, MemoryError, UnicodeDecodeError),
-    ) as error:
-        raise DatasetError(f'{path}: cannot be read as a bag ({error})') from error
+    with open_any_bag(path) as reader:
+        with reading(path):
+            bag = Bag(path, reader, contract, namespace)
+        yield bag
 
 
 def _field_type(kind: Nodetype, content: Any) -> FieldType:

@@ -1,12 +1,13 @@
 """Start one robot whose policy node is configured and activated by launch.
 
-If the policy cannot be configured, everything is shut down.
+If the policy cannot be configured, or ends, everything is shut down.
 """
 
-from launch import LaunchDescription
+from launch import Action, LaunchContext, LaunchDescription
 from launch.actions import (
     EmitEvent,
     IncludeLaunchDescription,
+    OpaqueFunction,
     RegisterEventHandler,
     Shutdown,
 )
@@ -17,70 +18,66 @@ from launch_ros.actions import LifecycleNode
 from launch_ros.event_handlers import OnStateTransition
 from launch_ros.events.lifecycle import ChangeState
 from lifecycle_msgs.msg import Transition
-from metagcttt.launch_arguments import declare, SHARE, text
+from metagcttt.launch_arguments import ALL, common, declare, given, Respawns, SHARE
 
-ARGUMENTS = ('namespace', 'stepping', 'params_file', 'checkpoint', 'dataset')
+ARGUMENTS = tuple(name for name in ALL if name not in ('autostart', 'policy'))
 
 
-def generate_launch_description() -> LaunchDescription:
-    """The robot without its policy, the policy node and the handlers of its lifecycle."""
-    policy = LifecycleNode(
-        package='metagcttt',
+def policy(context: LaunchContext) -> list[Action]:
+    """The policy node and the handlers of its lifecycle, which come before what they handle."""
+    shared = common(context)
+    del shared['respawn'], shared['respawn_delay']
+    node = LifecycleNode(
         executable='policy_node',
         name='policy_node',
-        namespace=LaunchConfiguration('namespace'),
-        output='screen',
         parameters=[
             LaunchConfiguration('params_file'),
-            {
-                'autostart': False,
-                'use_sim_time': True,
-                'checkpoint': text('checkpoint'),
-                'dataset': text('dataset'),
-            },
+            {'autostart': False},
+            given(context, 'checkpoint', 'dataset', 'use_sim_time'),
         ],
+        **shared | {'on_exit': Respawns(0).on_exit},
     )
 
     def request(transition_id: int) -> EmitEvent:
         return EmitEvent(
             event=ChangeState(
-                lifecycle_node_matcher=matches_action(policy), transition_id=transition_id
+                lifecycle_node_matcher=matches_action(node), transition_id=transition_id
             )
         )
 
+    return [
+        RegisterEventHandler(
+            OnStateTransition(
+                target_lifecycle_node=node,
+                start_state='configuring',
+                goal_state='inactive',
+                entities=[request(Transition.TRANSITION_ACTIVATE)],
+            )
+        ),
+        RegisterEventHandler(
+            OnStateTransition(
+                target_lifecycle_node=node,
+                start_state='configuring',
+                goal_state='unconfigured',
+                entities=[Shutdown(reason='the policy cannot be configured, see its log')],
+            )
+        ),
+        node,
+        request(Transition.TRANSITION_CONFIGURE),
+    ]
+
+
+def generate_launch_description() -> LaunchDescription:
+    """The robot without its policy, then the policy."""
+    rest = IncludeLaunchDescription(
+        PythonLaunchDescriptionSource(
+            PathJoinSubstitution([SHARE, 'launch', 'metagcttt.launch.py'])
+        ),
+        launch_arguments={
+            **{name: LaunchConfiguration(name) for name in ARGUMENTS},
+            'policy': 'false',
+        }.items(),
+    )
     return LaunchDescription(
-        [
-            *declare(*ARGUMENTS),
-            IncludeLaunchDescription(
-                PythonLaunchDescriptionSource(
-                    PathJoinSubstitution([SHARE, 'launch', 'metagcttt.launch.py'])
-                ),
-                launch_arguments={
-                    'namespace': LaunchConfiguration('namespace'),
-                    'stepping': LaunchConfiguration('stepping'),
-                    'params_file': LaunchConfiguration('params_file'),
-                    'dataset': LaunchConfiguration('dataset'),
-                    'policy': 'false',
-                }.items(),
-            ),
-            # The handlers come before the events they handle.
-            RegisterEventHandler(
-                OnStateTransition(
-                    target_lifecycle_node=policy,
-                    start_state='configuring',
-                    goal_state='inactive',
-                    entities=[request(Transition.TRANSITION_ACTIVATE)],
-                )
-            ),
-            RegisterEventHandler(
-                OnStateTransition(
-                    target_lifecycle_node=policy,
-                    start_state='configuring',
-                    goal_state='unconfigured',
-                    entities=[Shutdown(reason='the policy cannot be configured, see its log')],
-                )
-            ),
-            policy,
-            request(Transition.TRANSITION_CONFIGURE),
-        ]
+        [*declare(__file__, *ARGUMENTS), rest, OpaqueFunction(function=policy)]
     )

@@ -1,7 +1,11 @@
 """Start two robots in one graph, each with its own namespace, maze and simulated time."""
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, GroupAction, IncludeLaunchDescription
+from launch import LaunchContext, LaunchDescription
+from launch.actions import (
+    GroupAction,
+    IncludeLaunchDescription,
+    OpaqueFunction,
+)
 from launch.conditions import IfCondition
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import (
@@ -10,19 +14,18 @@ from launch.substitutions import (
     PathJoinSubstitution,
 )
 from launch_ros.actions import Node
-from metagcttt.launch_arguments import declare, SHARE, text
+from metagcttt.launch_arguments import declare, given, respawning, SHARE
 
 ROBOTS = ('robot1', 'robot2')
-SHARED = ('stepping', 'environment', 'visualize', 'log_level')
+SHARED = (
+    *('stepping', 'params_file', 'environment', 'dataset', 'autostart', 'use_sim_time'),
+    *('visualize', 'respawn_limit', 'log_level'),
+)
 
-CHECKPOINTS = [
-    DeclareLaunchArgument(
-        f'{robot}_checkpoint',
-        default_value='',
-        description=f'folder of the policy of {robot}; empty: the committed one',
-    )
+CHECKPOINTS = {
+    f'{robot}_checkpoint': f"folder of the policy of {robot}; empty: the parameter file's"
     for robot in ROBOTS
-]
+}
 
 
 def robot_group(robot: str) -> GroupAction:
@@ -32,7 +35,7 @@ def robot_group(robot: str) -> GroupAction:
     arguments['namespace'] = robot
     arguments['clock_topic'] = 'clock'
     arguments['checkpoint'] = LaunchConfiguration(f'{robot}_checkpoint')
-    arguments['record'] = ''
+    arguments |= {'record': '', 'policy': 'true', 'rviz': 'false'}
     return GroupAction(
         [
             IncludeLaunchDescription(
@@ -42,21 +45,28 @@ def robot_group(robot: str) -> GroupAction:
     )
 
 
+def recorder(context: LaunchContext) -> list[Node]:
+    """The recorder of both robots."""
+    return [
+        Node(
+            package='metagcttt',
+            executable='recorder_node',
+            name='recorder_node',
+            output='screen',
+            parameters=[{'output': given(context, 'record').get('record', '')}],
+            arguments=['--ros-args', '--log-level', LaunchConfiguration('log_level')],
+            condition=IfCondition(NotEqualsSubstitution(LaunchConfiguration('record'), '')),
+            **respawning(context),
+        )
+    ]
+
+
 def generate_launch_description() -> LaunchDescription:
     """Two robots and, with `record`, one recorder for both."""
-    record = LaunchConfiguration('record')
     return LaunchDescription(
         [
-            *declare(*SHARED, 'record'),
-            *CHECKPOINTS,
+            *declare(__file__, *SHARED, 'record', **CHECKPOINTS),
             *(robot_group(robot) for robot in ROBOTS),
-            Node(
-                package='metagcttt',
-                executable='recorder_node',
-                name='recorder_node',
-                output='screen',
-                parameters=[{'output': text('record')}],
-                condition=IfCondition(NotEqualsSubstitution(record, '')),
-            ),
+            OpaqueFunction(function=recorder),
         ]
     )

@@ -20,6 +20,12 @@ CHECKPOINT = Parameter('checkpoint', '', 'folder of the policy; empty: the commi
 DATASET = Parameter('dataset', '', 'dataset file (.npz); empty: the committed one')
 
 GOAL_NODE = (
+    Parameter(
+        'contract',
+        '',
+        "a robot's contract (YAML), whose frame, tolerances, time and map decide about goals "
+        'instead of those of `environment`; empty: a maze',
+    ),
     ENVIRONMENT,
     DATASET,
     STEPPING,
@@ -151,6 +157,21 @@ POLICY_NODE = (
         changes='now',
     ),
     Parameter(
+        'engine',
+        'auto',
+        'what computes the gradient steps: kernels in C, the same in tensor operations, autograd; '
+        'auto: the first of them that policy and machine have',
+        choices=('auto', 'kernels', 'analytic', 'eager'),
+        changes='now',
+    ),
+    Parameter(
+        'precision',
+        'float32',
+        'of the matrix products; auto: bfloat16 where the machine gains by it',
+        choices=('float32', 'bfloat16', 'auto'),
+        changes='now',
+    ),
+    Parameter(
         'horizon',
         0,
         'control steps after which to adapt again from the base weights; 0: never',
@@ -180,9 +201,10 @@ POLICY_NODE = (
     ),
     Parameter(
         'epsilon',
-        1.0,
-        'distance within which a trajectory has to pass the robot to be relevant, metres',
-        (0.001, 1000),
+        0.0,
+        'distance within which a trajectory has to pass the robot to be relevant, metres; 0: that '
+        "of the robot's contract, or 1",
+        (0, 1000),
         changes='configure',
     ),
     Parameter(
@@ -241,7 +263,14 @@ POLICY_NODE = (
 
 RECORDER_NODE = (
     Parameter(
-        'output', '', 'file to write (.mcap), which must not exist; empty: ./rec-DATE-TIME.mcap'
+        'output',
+        '',
+        'file (.mcap) or bag folder to write, which must not exist; empty: ./rec-DATE-TIME.mcap',
+    ),
+    Parameter(
+        'hidden_topics',
+        False,
+        'record hidden topics too, such as the feedback and the status of actions',
     ),
     Parameter('split_mb', 0.0, 'start a new file at this size, megabytes; 0: never', (0, 1000000)),
     Parameter(

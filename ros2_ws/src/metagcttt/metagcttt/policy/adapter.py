@@ -120,6 +120,7 @@ class GoalAdapter:
             self._publishers.publish_report(pursuit.goal, failed)
         else:
             self._monitor.adapt_ms.add(1000 * adaptation.seconds)
+            self._monitor.engine = adaptation.engine or self._monitor.engine
             self._cache.keep(key, adaptation)
             self._conclude(pursuit, adaptation)
             if pursuit.config.horizon and base.value_fn is not None:

@@ -1,7 +1,8 @@
 """A base policy with the dataset it adapts on, and its adaptation to a goal."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from metagcttt_core import (
     adapt,
@@ -14,8 +15,11 @@ from metagcttt_core import (
     TTTConfig,
 )
 from metagcttt_core.adaptation import AdaptationCancelled, OnStep
+from metagcttt_core.adaptation.inner_loop import run_inner_loop
 from metagcttt_core.config.assets import checkpoint_path, dataset_path
 from metagcttt_core.retrieval.value_cache import ValueFunction
+from metagcttt_core.robot import identity_fault
+from metagcttt_core.training.config import EngineName
 from metagcttt_core.training.optimizers import pretrained_state
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +35,16 @@ class Deployment:
     trajectory_filter: TrajectoryFilter
 
     @property
+    def contract(self) -> Mapping[str, Any] | None:
+        """The identity of the robot's contract that they were made for, if any."""
+        return self.agent.metadata.get('contract') or self.dataset.contract
+
+    def contract_fault(self, fingerprint: str) -> str:
+        """Why a state of the contract with that fingerprint is none for them; empty if it is."""
+        met = {'robot': 'the robot of the state', 'fingerprint': fingerprint}
+        return identity_fault('the policy', self.contract, met if fingerprint else None)
+
+    @property
     def dataset(self) -> TrajectoryDataset:
         """The dataset behind the filter."""
         return self.trajectory_filter.dataset
@@ -43,6 +57,14 @@ class Deployment:
         """
         if choice == 'pretrained':
             pretrained_state(self.agent)
+
+    def check_engine(self, name: EngineName) -> None:
+        """Refuse an engine that policy or machine do not have.
+
+        Raises:
+            ValueError: With the reason.
+        """
+        run_inner_loop(self.agent, [], lr=0.0, engine=name)
 
 
 @dataclass(frozen=True)
@@ -61,13 +83,16 @@ class _CancellableValue:
         return self.value_fn(observations, goal)
 
 
-def load_deployment(checkpoint: str, dataset: str, config: FilterConfig) -> Deployment:
+def load_deployment(
+    checkpoint: str, dataset: str, config: FilterConfig, *, epsilon_of_contract: bool = False
+) -> Deployment:
     """Load a policy, and load and index its dataset.
 
     Args:
         checkpoint: Folder of the checkpoint; empty for the committed one.
         dataset: File of the dataset; empty for the committed one.
-        config: Selection of sub-trajectories.
+        config: Selection of sub-trajectories; a robot's contract decides about the position.
+        epsilon_of_contract: Whether it also decides about epsilon, if it names one.
 
     Raises:
         FileNotFoundError: If the committed assets are asked for and missing.
@@ -82,21 +107,43 @@ def load_deployment(checkpoint: str, dataset: str, config: FilterConfig) -> Depl
             f'actions of {agent.act_dim} values, the dataset {dataset_file} has {data.obs_dim} '
             f'and {data.act_dim}'
         )
-    return Deployment(agent, TrajectoryFilter(data, config))
+    made_for = agent.metadata.get('contract')
+    if fault := identity_fault(f'the dataset {dataset_file}', data.contract, made_for):
+        raise ValueError(f'{fault}, as the checkpoint {checkpoint_folder} is')
+    contract = made_for or data.contract or {}
+    changes = {'position_dims': contract.get('position_dims')}
+    if epsilon_of_contract:
+        changes['epsilon'] = contract.get('epsilon')
+    given = {name: value for name, value in changes.items() if value}
+    return Deployment(agent, TrajectoryFilter(data, FilterConfig(**config.model_dump() | given)))
 
 
-def warm_up(deployment: Deployment) -> None:
-    """Take one gradient step and discard it; policy and dataset are not changed.
+def warm_up(deployment: Deployment, config: TTTConfig) -> str:
+    """Take one gradient step, as `config` will, and discard it; no goal waits for it later.
 
-    At the first step PyTorch imports and initialises for a second or two, which would stall the
-    control loop.
+    At the first step PyTorch imports and initialises for a second or two, and kernels that this
+    machine does not have yet are compiled.
+
+    Returns:
+        The engine that took it.
+
+    Raises:
+        ValueError: If policy or machine do not have the engine that is asked for.
     """
-    observation = np.asarray(deployment.dataset.observations[0], dtype=np.float64)
-    agent, trajectory_filter = deployment.agent, deployment.trajectory_filter
-    support = trajectory_filter.query(observation, observation, agent.value_fn)
-    config = TTTConfig(steps=1, batch_size=2)
-    adapt(agent, deployment.dataset, support, observation, config)
+    agent, dataset = deployment.agent, deployment.dataset
+    observation = np.asarray(dataset.states(0), dtype=np.float64)
+    deployment.trajectory_filter.query(observation, observation, agent.value_fn)
+    batch = agent.relabeller(dataset).sample(config.batch_size, np.random.default_rng(0))
+    step = run_inner_loop(
+        agent,
+        [agent.tensors(batch)],
+        lr=config.lr,
+        actor_only=config.actor_only,
+        engine=config.engine,
+        precision=config.precision,
+    )
     agent.act(observation, observation)
+    return step.engine
 
 
 def adapt_to_goal(

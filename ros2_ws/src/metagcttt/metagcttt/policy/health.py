@@ -9,8 +9,13 @@ from metagcttt.policy.decision import Pursuit
 class PolicyMonitor:
     """Collects statistics while a policy runs and judges its health."""
 
-    def __init__(self) -> None:
-        """Start with empty statistics."""
+    def __init__(self, engine: str) -> None:
+        """Start with empty statistics.
+
+        Args:
+            engine: What computes gradient steps; `Adaptation.engine`.
+        """
+        self.engine = engine
         self.states = Rate()
         self.actions = Rate()
         self.latency_ms = Samples()
@@ -53,6 +58,7 @@ class PolicyMonitor:
             'latency_p99_ms': f'{latency_ms:.2f}',
             'missed_deadlines': str(self.deadlines.total),
             'missed_deadlines_last_minute': str(missed),
+            'adapt_engine': self.engine,
             'adapt_last_ms': f'{self.adapt_ms.last():.1f}',
             'adapt_p99_ms': f'{self.adapt_ms.percentile(99):.1f}',
             'adaptations_pending': str(num_pending),

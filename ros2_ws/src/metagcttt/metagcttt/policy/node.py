@@ -4,6 +4,7 @@ import secrets
 from typing import Any
 
 from metagcttt_core import FilterConfig
+from metagcttt_core.training.numerics import resolve_precision
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -15,7 +16,7 @@ from metagcttt.health import Health, Level
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import POLICY_NODE
 from metagcttt.policy.deployment import load_deployment, warm_up
-from metagcttt.policy.session import PolicySession
+from metagcttt.policy.session import inner_loop, PolicySession
 
 
 class PolicyNode(LifecycleNode):
@@ -65,15 +66,18 @@ class PolicyNode(LifecycleNode):
         """Load policy and dataset, and connect; a failure leaves the node unconfigured."""
         config = FilterConfig(
             variant=self._settings['filter_variant'],
-            epsilon=self._settings['epsilon'],
+            epsilon=self._settings['epsilon'] or 1.0,
             top_percent=self._settings['top_percent'],
         )
         try:
             deployment = load_deployment(
-                self._settings['checkpoint'], self._settings['dataset'], config
+                self._settings['checkpoint'],
+                self._settings['dataset'],
+                config,
+                epsilon_of_contract=not self._settings['epsilon'],
             )
             deployment.check_optimizer_state(self._settings['optimizer_state'])
-            warm_up(deployment)
+            engine = warm_up(deployment, inner_loop(self._settings))
         except (OSError, ValueError) as error:
             # rclpy would swallow it silently.
             self._failure = f'cannot configure: {error}'
@@ -83,13 +87,19 @@ class PolicyNode(LifecycleNode):
             torch.set_num_threads(self._settings['threads'])
         self._failure = ''
         self._session = PolicySession(
-            self, self._settings, deployment, instance=self._instance, enabled=self._enabled
+            self,
+            self._settings,
+            deployment,
+            engine=engine,
+            instance=self._instance,
+            enabled=self._enabled,
         )
         agent, dataset = deployment.agent, deployment.dataset
         self.get_logger().info(
             f'{agent.name} policy for observations of {agent.obs_dim} and actions of '
             f'{agent.act_dim} values; {dataset.num_episodes} trajectories, '
-            f'{dataset.num_transitions} transitions'
+            f'{dataset.num_transitions} transitions; gradient steps by engine {engine}, with '
+            f'products in {resolve_precision(self._settings["precision"], agent)}'
         )
         return TransitionCallbackReturn.SUCCESS
 
@@ -137,6 +147,8 @@ class PolicyNode(LifecycleNode):
             for parameter in parameters:
                 if parameter.name == 'optimizer_state' and self._session is not None:
                     self._session.deployment.check_optimizer_state(parameter.value)
+                if parameter.name == 'engine' and self._session is not None:
+                    self._session.deployment.check_engine(parameter.value)
         except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

@@ -25,6 +25,22 @@ WARNING_PERIOD_S = 5.0
 WATCHDOG_PERIOD_S = 0.1
 
 
+def inner_loop(settings: ParameterSet) -> TTTConfig:
+    """The inner loop that the parameters ask for."""
+    return TTTConfig(
+        steps=settings['adapt_steps'],
+        lr=settings['adapt_lr'],
+        batch_size=settings['adapt_batch_size'],
+        early_stopping=settings['early_stopping'],
+        test_fraction=settings['test_fraction'],
+        actor_only=settings['actor_only'],
+        optimizer_state=settings['optimizer_state'],
+        engine=settings['engine'],
+        precision=settings['precision'],
+        horizon=settings['horizon'] or None,
+    )
+
+
 class PolicySession:
     """The policy node's state and behaviour between configuration and cleanup.
 
@@ -42,6 +58,7 @@ class PolicySession:
         settings: ParameterSet,
         deployment: Deployment,
         *,
+        engine: str,
         instance: int,
         enabled: bool = True,
     ) -> None:
@@ -51,6 +68,7 @@ class PolicySession:
             node: The node that owns them.
             settings: Its parameters.
             deployment: Policy and dataset.
+            engine: What computes gradient steps, for the diagnostics.
             instance: Random number that identifies this policy in the graph.
             enabled: Whether actions may be other than zero.
         """
@@ -69,7 +87,7 @@ class PolicySession:
         # In lockstep, states are delivered in order, and one that begins again has no successor.
         self._order = WorldOrder(1 if self._lockstep else RESTART_STATES)
         self._clock = JumpFreeClock(node)
-        self._monitor = PolicyMonitor()
+        self._monitor = PolicyMonitor(engine)
         self._safety = Safety(enabled=enabled)
         self._publishers = PolicyPublishers(node, instance)
         self._adapter = GoalAdapter(
@@ -143,7 +161,9 @@ class PolicySession:
             Moment(message.world_id, message.episode_id, message.step), info['source_timestamp']
         )
         observation = to_array(message.observation)
-        fault = vector_fault('the state', observation, self.deployment.agent.obs_dim)
+        fault = self.deployment.contract_fault(message.contract) or vector_fault(
+            'the state', observation, self.deployment.agent.obs_dim
+        )
         if out_of_order:
             self._monitor.faults.note('states_out_of_order', out_of_order, now_s)
         elif fault:
@@ -189,25 +209,13 @@ class PolicySession:
         else:
             self._pursuit = Pursuit(
                 goal,
-                config=self._ttt_config(),
+                config=inner_loop(self._settings),
                 hold=self._settings['adaptation'] == 'hold',
                 adaptation=Adaptation(agent, reason='no state to adapt to yet'),
             )
         self._proceed()
         if self._pursuit is None and self._timer is not None:
             self._on_tick()  # a stop does not wait for the next tick
-
-    def _ttt_config(self) -> TTTConfig:
-        return TTTConfig(
-            steps=self._settings['adapt_steps'],
-            lr=self._settings['adapt_lr'],
-            batch_size=self._settings['adapt_batch_size'],
-            early_stopping=self._settings['early_stopping'],
-            test_fraction=self._settings['test_fraction'],
-            actor_only=self._settings['actor_only'],
-            optimizer_state=self._settings['optimizer_state'],
-            horizon=self._settings['horizon'] or None,
-        )
 
     # --- behaviour ---------------------------------------------------------------------------
 

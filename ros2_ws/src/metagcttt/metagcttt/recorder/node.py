@@ -11,6 +11,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import RECORDER_NODE
@@ -18,11 +19,11 @@ from metagcttt.qos import recording_profile
 from metagcttt.recorder.recording import message_class, Recording, UnknownTypeError
 
 SEARCH_PERIOD_S = 0.1
-QUIET_S = 0.2
-GRACE_S = 1.2
+QUIET_S = 0.5
+DRAIN_S = 0.1
+GRACE_S = 2.0
 OF_ALL_ROBOTS = ('/clock', '/diagnostics')
-OF_OPERATORS = ('goal_pose',)
-HEARD_S = 1.0
+ORDERS = ('goal_pose', 'stop')
 OF_ROS = ('/rosout', '/parameter_events')
 
 
@@ -30,9 +31,9 @@ class RecorderNode(Node):
     """Records every topic of its namespace, and those that all robots share.
 
     Serialized messages go to the file unchanged. A subscription follows the QoS of the topic's
-    publishers. On topics that take orders it joins late and leaves with the last publisher:
-    `ros2 topic pub --once` sends as soon as anybody listens, and an order that only the recorder
-    hears is lost.
+    publishers. It never listens to the topics that take orders: `ros2 topic pub --once` sends as
+    soon as anybody listens, and an order that only the recorder hears is lost. What became of a
+    goal is on `goal` and `episode`, of a stop on `/diagnostics`.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -42,7 +43,8 @@ class RecorderNode(Node):
             kwargs: For `rclpy.node.Node`.
 
         Raises:
-            OSError: If the file exists or cannot be written.
+            OSError: If the file or folder exists or cannot be written.
+            ValueError: If the output is of another kind.
         """
         super().__init__('recorder_node', **kwargs)
         self._settings = ParameterSet(self, RECORDER_NODE, is_configured=lambda: True)
@@ -52,8 +54,6 @@ class RecorderNode(Node):
         )
         self._subscriptions_by_topic: dict[str, Subscription] = {}
         self._refused: set[str] = set()
-        self._inputs = {self.resolve_topic_name(name) for name in OF_OPERATORS}
-        self._published_since_s: dict[str, float] = {}
         # Not the node's clock, which stops when the simulation is paused.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(SEARCH_PERIOD_S, self._search, clock=steady)
@@ -64,14 +64,19 @@ class RecorderNode(Node):
     def destroy_node(self) -> None:
         """Record what is still in transit, finish the file and destroy the node.
 
-        Ends after `QUIET_S` without a message, and after `GRACE_S` on a busy graph.
+        Where all end together, those that publish here end first, so that their last words are
+        recorded; a graph that goes on is left after `GRACE_S`, a quiet one after `QUIET_S`.
         """
+        self._recording.flush()
         executor = SingleThreadedExecutor(context=self.context)
         executor.add_node(self)
         begin = heard = time.monotonic()
-        while (now := time.monotonic()) < min(heard + QUIET_S, begin + GRACE_S):
+        while (now := time.monotonic()) < begin + GRACE_S:
+            is_published = any(map(self.count_publishers, self._subscriptions_by_topic))
+            if now > heard + (QUIET_S if is_published else DRAIN_S):
+                break
             before = self._recording.num_messages
-            executor.spin_once(timeout_sec=heard + QUIET_S - now)
+            executor.spin_once(timeout_sec=DRAIN_S / 2)
             if self._recording.num_messages > before:
                 heard = time.monotonic()
         executor.shutdown()
@@ -85,42 +90,40 @@ class RecorderNode(Node):
         for topic, types in self.get_topic_names_and_types():
             if not self._is_wanted(topic):
                 continue
-            publishers = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
-            if topic in self._inputs and not self._is_heard(topic, bool(publishers)):
-                continue
+            publishers = self.get_publishers_info_by_topic(topic)
             if not publishers:
                 continue
-            profile = recording_profile(publishers)
+            profile = recording_profile([info.qos_profile for info in publishers])
             known = self._subscriptions_by_topic.get(topic)
-            if known is None:
-                self._subscribe(topic, types, profile)
-            elif _quality(known.qos_profile) != _quality(profile):
+            if known is not None and _quality(known.qos_profile) == _quality(profile):
+                continue
+            if known is not None:
                 self.destroy_subscription(known)
-                self._subscribe(topic, types, profile)
-
-    def _is_heard(self, topic: str, is_published: bool) -> bool:
-        """True once the readers of an input have had the time to be matched with its publisher."""
-        now_s = time.monotonic()
-        if is_published:
-            return now_s - self._published_since_s.setdefault(topic, now_s) >= HEARD_S
-        self._published_since_s.pop(topic, None)
-        subscription = self._subscriptions_by_topic.pop(topic, None)
-        if subscription is not None:
-            self.destroy_subscription(subscription)
-        return False
+            self._subscribe(topic, types, profile, publishers)
 
     def _is_wanted(self, topic: str) -> bool:
-        if topic in OF_ROS or topic in self._refused:
+        if topic in OF_ROS or topic in self._refused or topic.rpartition('/')[2] in ORDERS:
+            return False
+        is_hidden = any(name.startswith('_') for name in topic.split('/'))
+        if is_hidden and not self._settings['hidden_topics']:
             return False
         inside = topic.startswith(self.get_namespace().rstrip('/') + '/')
         return inside or topic in OF_ALL_ROBOTS
 
-    def _subscribe(self, topic: str, types: list[str], profile: QoSProfile) -> None:
+    def _subscribe(
+        self,
+        topic: str,
+        types: list[str],
+        profile: QoSProfile,
+        publishers: list[TopicEndpointInfo],
+    ) -> None:
+        type_hash = str(publishers[0].topic_type_hash).removeprefix('INVALID')
+        offered = [info.qos_profile for info in publishers]
         try:
             if len(types) > 1:
                 raise UnknownTypeError(f'it has several types: {", ".join(types)}')
             message_type = message_class(types[0])
-            self._recording.add_topic(topic, types[0])
+            self._recording.add_topic(topic, types[0], offered, type_hash)
         except UnknownTypeError as error:
             self._refused.add(topic)
             self.get_logger().warning(f'{topic} is not recorded: {error}')
@@ -131,6 +134,7 @@ class RecorderNode(Node):
         self.get_logger().info(f'recording {topic} ({types[0]})')
 
     def _on_message(self, topic: str, data: bytes, info: dict[str, int]) -> None:
+        # Both of the system clock; the stamp in a header may be simulated, and stays inside.
         received = time.time_ns()
         published = info['source_timestamp'] or received
         # Simulated time may run so fast that this node's own delay would matter.

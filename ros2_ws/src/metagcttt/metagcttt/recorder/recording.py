@@ -1,6 +1,6 @@
-"""MCAP files of serialized ROS messages, for standard tools."""
+"""MCAP files and bag folders of serialized ROS messages, for standard tools."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
 import re
@@ -9,8 +9,14 @@ from typing import Any
 from ament_index_python.packages import get_package_share_directory
 from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
 from mcap.writer import Writer
+from rclpy.qos import QoSProfile
+import yaml
 
-_TYPE = re.compile(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)')
+from metagcttt.recorder.bag_metadata import bag_metadata, NAME, qos_as_yaml, Span, Topic
+
+_MESSAGE = re.compile(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)')
+_FEEDBACK = re.compile(r'([a-z][a-z0-9_]*)/action/([A-Z][A-Za-z0-9]*)_FeedbackMessage')
+_OTHER_BAGS = ('.bag', '.db3', '.yaml')
 _SEPARATOR = '=' * 80 + '\n'
 _BUILTIN = frozenset(
     'bool byte char float32 float64 int8 uint8 int16 uint16 int32 uint32 int64 uint64 '
@@ -23,18 +29,19 @@ class UnknownTypeError(LookupError):
 
 
 def message_class(type_name: str) -> Any:
-    """The class of a type such as `nav_msgs/msg/Path`.
+    """The class of a type such as `nav_msgs/msg/Path` or `.../action/NAME_FeedbackMessage`.
 
     Raises:
         UnknownTypeError: If it is no message type or its package is not installed.
     """
-    match = _TYPE.fullmatch(type_name)
-    if match is None:
-        raise UnknownTypeError(f'{type_name} is not a message type')
     try:
-        return getattr(import_module(f'{match[1]}.msg'), match[2])
+        if match := _MESSAGE.fullmatch(type_name):
+            return getattr(import_module(f'{match[1]}.msg'), match[2])
+        if match := _FEEDBACK.fullmatch(type_name):
+            return getattr(import_module(f'{match[1]}.action'), match[2]).Impl.FeedbackMessage
     except (ModuleNotFoundError, AttributeError) as error:
         raise UnknownTypeError(f'{type_name} is not installed here ({error})') from error
+    raise UnknownTypeError(f'{type_name} is not a message type')
 
 
 def message_definition(type_name: str) -> str:
@@ -43,7 +50,15 @@ def message_definition(type_name: str) -> str:
     Raises:
         UnknownTypeError: If a definition is not installed.
     """
-    text = _definition_file(type_name)
+    parts = {}
+    if feedback := _FEEDBACK.fullmatch(type_name):
+        package, action = feedback.groups()
+        # What rosidl makes of the third part of an action's definition.
+        inner = f'{package}/action/{action}_Feedback'
+        text = f'unique_identifier_msgs/UUID goal_id\n{inner} feedback\n'
+        parts[inner] = _definition_file(package, 'action', action).split('\n---\n')[-1]
+    else:
+        text = _message_definition(type_name)
     seen = {type_name}
     waiting = list(_types_in(type_name, text))
     while waiting:
@@ -51,19 +66,25 @@ def message_definition(type_name: str) -> str:
         if name in seen:
             continue
         seen.add(name)
-        part = _definition_file(name)
+        part = parts.get(name) or _message_definition(name)
         waiting += _types_in(name, part)
         text += f'\n{_SEPARATOR}MSG: {name.replace("/msg/", "/")}\n{part}'
     return text
 
 
-def _definition_file(type_name: str) -> str:
-    package, _, name = type_name.split('/')
+def _message_definition(type_name: str) -> str:
+    package, kind, name = type_name.split('/')
+    return _definition_file(package, kind, name)
+
+
+def _definition_file(package: str, kind: str, name: str) -> str:
+    """The definition of a message (kind `msg`) or an action (`action`)."""
     try:
-        file = Path(get_package_share_directory(package)) / 'msg' / f'{name}.msg'
+        file = Path(get_package_share_directory(package)) / kind / f'{name}.{kind}'
         return file.read_text(encoding='utf-8')
     except (LookupError, OSError) as error:
-        raise UnknownTypeError(f'{type_name}: its definition is missing ({error})') from error
+        reason = f'{package}/{kind}/{name}: its definition is missing ({error})'
+        raise UnknownTypeError(reason) from error
 
 
 def _types_in(type_name: str, text: str) -> Iterator[str]:
@@ -76,14 +97,18 @@ def _types_in(type_name: str, text: str) -> Iterator[str]:
         base = re.split(r'\[|<', words[0])[0]
         if base in _BUILTIN:
             continue
-        owner, _, name = base.rpartition('/')
-        yield f'{owner.removesuffix("/msg") or package}/msg/{name}'
+        if base.count('/') == 2:
+            yield base
+        else:
+            owner, _, name = base.rpartition('/')
+            yield f'{owner or package}/msg/{name}'
 
 
 class Recording:
-    """A recording in one MCAP file or, with a size limit, in consecutive files.
+    """A recording: one MCAP file or, with a size limit, consecutive files, or a bag folder.
 
-    If the process is killed, a file is readable up to the last `flush`. An existing file is never
+    A folder is what `ros2 bag record` makes: NAME/NAME_0.mcap and so on, and metadata.yaml. If the
+    process is killed, a recording is readable up to the last `flush`. Nothing that exists is
     overwritten.
     """
 
@@ -91,28 +116,54 @@ class Recording:
         """Create the first file.
 
         Args:
-            path: The file; later ones are NAME_1.mcap, NAME_2.mcap and so on beside it.
+            path: A name that ends in .mcap: the file; later ones are NAME_1.mcap, NAME_2.mcap
+                and so on beside it. Otherwise a folder.
             split_bytes: Size at which the next file starts; 0: never.
 
         Raises:
-            OSError: If the file exists or cannot be written.
+            OSError: If the file or folder exists or cannot be written.
+            ValueError: If the name is that of another kind of bag.
         """
-        self._first = path
+        if path.suffix in _OTHER_BAGS:
+            raise ValueError(f'{path}: bags are written as .mcap, or as a folder with that')
+        self._folder = None if path.suffix == '.mcap' else path
+        self._first = path if self._folder is None else path / f'{path.name}_0.mcap'
         self._split_bytes = split_bytes
-        self._types: dict[str, str] = {}
+        self._topics: dict[str, Topic] = {}
+        self._spans: dict[str, Span] = {}
+        self._all = Span()
         self.paths: list[Path] = []
-        self.num_messages = 0
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._open(path)
+        if self._folder is not None:
+            self._folder.mkdir()
+        self._open(self._first)
 
-    def add_topic(self, topic: str, type_name: str) -> None:
+    @property
+    def num_messages(self) -> int:
+        """Number of messages so far."""
+        return self._all.count
+
+    def add_topic(
+        self,
+        topic: str,
+        type_name: str,
+        offered: Sequence[QoSProfile] = (),
+        type_hash: str = '',
+    ) -> None:
         """Register a topic before its first message.
+
+        Args:
+            topic: The topic.
+            type_name: Its type.
+            offered: The qualities of service of its publishers, for those who play it.
+            type_hash: The hash of its type, if known.
 
         Raises:
             UnknownTypeError: If the definition of its type is not installed.
         """
-        self._register(topic, type_name)
-        self._types[topic] = type_name
+        entry = Topic(type_name, offered, type_hash)
+        self._register(topic, entry)
+        self._topics.setdefault(topic, entry)
 
     def add(self, topic: str, data: bytes, *, log_time: int, publish_time: int) -> None:
         """Append one message.
@@ -120,12 +171,14 @@ class Recording:
         Args:
             topic: Its topic, registered with `add_topic`.
             data: The message, serialized as CDR.
-            log_time: Time of reception, nanoseconds since 1970.
-            publish_time: Time of publication, nanoseconds since 1970.
+            log_time: Time of reception by the system clock, nanoseconds since 1970.
+            publish_time: Time of publication by the system clock, nanoseconds since 1970. Neither
+                is the stamp of a header, which may be simulated time.
         """
         if self._split_bytes and self._file.tell() >= self._split_bytes:
-            self.close()
-            self._open(self._first.with_stem(f'{self._first.stem}_{len(self.paths)}'))
+            self._close_file()
+            stem = self._first.stem.removesuffix('_0') if self._folder else self._first.stem
+            self._open(self._first.with_stem(f'{stem}_{len(self.paths)}'))
         self._writer.add_message(
             self._channels[topic],
             log_time=log_time,
@@ -133,34 +186,55 @@ class Recording:
             publish_time=publish_time,
             sequence=self.num_messages & 0xFFFFFFFF,
         )
-        self.num_messages += 1
+        self._topics[topic].count += 1
+        for span in (self._all, self._spans[self.paths[-1].name]):
+            span.add(log_time)
 
     def flush(self) -> None:
         """Pass everything so far to the operating system, where it survives a kill."""
         self._writer.flush()
+        self._write_metadata()
 
     def close(self) -> None:
         """Write the index and close the file."""
+        self._close_file()
+        self._write_metadata()
+
+    def _close_file(self) -> None:
         self._writer.finish()
         self._file.close()
+
+    def _write_metadata(self) -> None:
+        if self._folder is not None:
+            text = bag_metadata(self._spans, self._all, self._topics)
+            new = self._folder / f'.{NAME}.new'
+            new.write_text(text, encoding='utf-8')
+            new.replace(self._folder / NAME)
 
     def _open(self, path: Path) -> None:
         self._file = path.open('xb')
         self.paths.append(path)
+        self._spans[path.name] = Span()
         self._writer = Writer(self._file)
         self._writer.start(profile=Profile.ROS2, library='metagcttt')
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
-        for topic, type_name in self._types.items():
-            self._register(topic, type_name)
+        for topic, entry in self._topics.items():
+            self._register(topic, entry)
+        self._write_metadata()
 
-    def _register(self, topic: str, type_name: str) -> None:
-        if type_name not in self._schemas:
-            text = message_definition(type_name)
-            self._schemas[type_name] = self._writer.register_schema(
-                type_name, SchemaEncoding.ROS2, text.encode()
+    def _register(self, topic: str, entry: Topic) -> None:
+        if entry.type_name not in self._schemas:
+            text = message_definition(entry.type_name)
+            self._schemas[entry.type_name] = self._writer.register_schema(
+                entry.type_name, SchemaEncoding.ROS2, text.encode()
             )
         if topic not in self._channels:
+            # As rosbag2 keeps them, for those who play the file without its folder.
+            offered = yaml.safe_dump([qos_as_yaml(profile) for profile in entry.offered])
             self._channels[topic] = self._writer.register_channel(
-                topic, MessageEncoding.CDR, self._schemas[type_name]
+                topic,
+                MessageEncoding.CDR,
+                self._schemas[entry.type_name],
+                {'offered_qos_profiles': offered, 'topic_type_hash': entry.type_hash},
             )

@@ -1,16 +1,17 @@
-"""What computes the gradient steps of the inner loop, and which an agent gets."""
+"""What computes gradient steps, and which an agent gets."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal, Protocol
 
 import torch
 from torch import nn, Tensor
 
-from metagcttt_core.adaptation.config import EngineName
 from metagcttt_core.agents.agent import Agent, TensorBatch
 from metagcttt_core.agents.analytic import AnalyticLoss
-from metagcttt_core.training.config import Precision
+from metagcttt_core.kernels import Kernels, KernelsUnavailable, load_kernels
+from metagcttt_core.training.config import EngineName, Precision
 from metagcttt_core.training.numerics import resolve_precision
+from metagcttt_core.training.optimizers import KernelAdam
 from metagcttt_core.training.step import gradient_step
 
 
@@ -18,7 +19,7 @@ class Engine(Protocol):
     """Gradient steps on the weights of one agent.
 
     Attributes:
-        name: `analytic` or `eager`.
+        name: `kernels`, `analytic` or `eager`.
     """
 
     name: str
@@ -73,8 +74,6 @@ class EagerEngine:
 class AnalyticEngine:
     """The loss with its gradient written out, which spares autograd and slow products."""
 
-    name = 'analytic'
-
     def __init__(
         self,
         agent: Agent,
@@ -84,20 +83,35 @@ class AnalyticEngine:
         test_loss: AnalyticLoss,
         *,
         actor_only: bool,
+        kernels: Kernels | None = None,
     ) -> None:
-        """Step as `EagerEngine`; the two losses of `agent` each work in their own memory."""
-        self._agent, self._optimizer = agent, optimizer
+        """Step as `EagerEngine`.
+
+        Args:
+            agent: What to train.
+            optimizer: Steps `parameters`.
+            parameters: Those that get a gradient.
+            loss: The loss of `agent`.
+            test_loss: The same, in memory of its own, which is kept for batches of one size.
+            actor_only: Train the actor and leave the rest.
+            kernels: What the losses compute with, for Adam's steps too.
+        """
+        self.name = 'analytic' if kernels is None else 'kernels'
+        self._agent = agent
         self._loss, self._test_loss = loss, test_loss
         self._actor_only = actor_only
         for parameter, gradient in zip(parameters, loss.gradients, strict=True):
             parameter.grad = gradient
+        self._step: Callable[[], object] = optimizer.step
+        if kernels is not None and isinstance(optimizer, torch.optim.Adam):
+            self._step = KernelAdam(optimizer, kernels).step
 
     def step(self, batch: TensorBatch) -> tuple[Tensor, dict[str, Tensor]]:
         """See `Engine`."""
         loss, parts = self._loss(batch)
         if not self._actor_only:
             self._agent.update_targets()
-        self._optimizer.step()
+        self._step()
         return loss, parts
 
     def test_loss(self, batch: TensorBatch) -> Tensor:
@@ -117,19 +131,52 @@ def make_engine(
     """The engine of that name for the gradient steps of `agent`.
 
     Args:
-        name: `auto` is the analytic one where the agent has such a loss, else the eager one.
+        name: `auto` is the best that agent and machine have: `kernels`, which need a C compiler or
+            what it made before; `analytic`, the same in tensor operations; else `eager`.
         agent: What to train, in place.
         optimizer: Steps `parameters`.
         parameters: `agent.trained_parameters`.
         actor_only: Train the actor and leave the rest.
         precision: Of the matrix products; weights, optimiser and sums are float32.
+
+    Raises:
+        ValueError: If the agent or the machine does not have the engine, with the reason.
     """
     resolved = resolve_precision(precision, agent)
-    if name == 'auto':
+    kernels = _kernels_for(name)
+    if name != 'eager':
         dtype = torch.bfloat16 if resolved == 'bfloat16' else torch.float32
-        losses = [agent.analytic_loss(actor_only=actor_only, dtype=dtype) for _ in range(2)]
-        if losses[0] is not None and losses[1] is not None:
+        loss, test_loss = (
+            agent.analytic_loss(actor_only=actor_only, dtype=dtype, kernels=kernels)
+            for _ in range(2)
+        )
+        if loss is not None and test_loss is not None:
             return AnalyticEngine(
-                agent, optimizer, parameters, losses[0], losses[1], actor_only=actor_only
+                agent,
+                optimizer,
+                parameters,
+                loss,
+                test_loss,
+                actor_only=actor_only,
+                kernels=kernels,
+            )
+        if name != 'auto':
+            raise ValueError(
+                f'engine {name}: agent {agent.name} has no loss written out for a standard '
+                f'deviation that is learned, for other devices than a processor, or at all; '
+                'use auto or eager'
             )
     return EagerEngine(agent, optimizer, parameters, actor_only=actor_only, precision=resolved)
+
+
+def _kernels_for(name: EngineName) -> Kernels | None:
+    if name not in ('auto', 'kernels'):
+        return None
+    try:
+        kernels = load_kernels()
+        _ = kernels.sgemm
+        return kernels
+    except KernelsUnavailable as error:
+        if name == 'kernels':
+            raise ValueError(f'engine kernels: {error}; use auto') from error
+        return None

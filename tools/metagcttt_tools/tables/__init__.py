@@ -1,0 +1,1 @@
+"""Tables of other people as datasets: CSV, parquet and LeRobotDataset v3. No ROS."""
