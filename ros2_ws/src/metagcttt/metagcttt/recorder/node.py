@@ -143,7 +143,14 @@ class RecorderNode(ConventionalNode):
         # Both of the system clock; the stamp in a header may be simulated, and stays inside.
         received = time.time_ns()
         published = info['source_timestamp'] or received
-        self._recording.add(topic, data, log_time=received, publish_time=published)
+        # Simulated time may run so fast that this node's own delay would matter.
+        is_simulated = self.get_parameter('use_sim_time').value
+        self._recording.add(
+            topic,
+            data,
+            log_time=published if is_simulated else received,
+            publish_time=published,
+        )
 
 
 def _quality(profile: QoSProfile) -> tuple[ReliabilityPolicy, DurabilityPolicy]:
