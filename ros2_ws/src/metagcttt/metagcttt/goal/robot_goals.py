@@ -223,7 +223,7 @@ class RobotGoals:
         if contract.position:
             dims = [contract.columns.index(name) for name in contract.position]
             xy = (float(observation[dims[0]]), float(observation[dims[1]]))
-            if self._section.map and set(dims) & set(fixed):
+            if self._section.map and set(dims) <= set(fixed):
                 self._check_map(xy)
         return Resolved(observation, xy, tuple(terms), self._section.timeout_s)
 
