@@ -122,6 +122,23 @@ def run(command: str, workplace: Path) -> None:
     assert result.returncode == 0, f'{command}\n{result.stdout[-2000:]}{result.stderr[-4000:]}'
 
 
+@pytest.mark.parametrize('document', ('README.md', 'docs/extending.md'))
+def test_every_python_block_runs(document: str, workplace: Path) -> None:
+    tokens = MarkdownIt('commonmark').parse((ROOT / document).read_text())
+    blocks = [token.content for token in tokens if token.info == 'python']
+    assert blocks
+    for number, block in enumerate(blocks):
+        (workplace / f'block{number}.py').write_text(block)
+        run(f'python block{number}.py', workplace)
+
+
+def test_other_documents_have_no_python_block() -> None:
+    """Those of ros2_ws/README.md need a graph: tests/ros/test_documentation.py runs them."""
+    named = {ROOT / name for name in ('README.md', 'docs/extending.md', 'ros2_ws/README.md')}
+    for document in {*ROOT.glob('*.md'), *ROOT.glob('docs/*.md')} - named:
+        assert '```python' not in document.read_text(), document
+
+
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize('document', DOCUMENTS)
 def test_every_command_runs(document: str, workplace: Path) -> None:

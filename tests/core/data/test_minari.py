@@ -203,6 +203,26 @@ def test_infos_that_nobody_needs_are_left_out(two_episodes):
     assert (dataset.num_episodes, dataset.extras) == (2, {})
 
 
+@pytest.mark.parametrize(
+    'infos',
+    [np.zeros(3), h5py.ExternalLink('elsewhere.hdf5', '/x'), h5py.SoftLink('/nowhere')],
+    ids=['array', 'external', 'soft'],
+)
+def test_infos_that_are_no_group_are_left_out(two_episodes, infos):
+    two_episodes['episode_1/infos'] = infos
+    two_episodes['episode_0/infos/qpos'] = np.array([b'text'] * 6)
+    assert loaded(two_episodes).extras == {}
+
+
+def test_infos_of_some_episodes_only_are_left_out(two_episodes):
+    two_episodes['episode_0/infos/qpos'] = np.zeros((6, 2))
+    for number in range(2):
+        two_episodes[f'episode_{number}/infos/qvel'] = np.ones((6, 3))
+    assert {name: array.shape for name, array in loaded(two_episodes).extras.items()} == {
+        'qvel': (12, 3)
+    }
+
+
 def external(file):
     file['episode_2'] = h5py.ExternalLink('not-copied-along.hdf5', '/episode_0')
 
@@ -224,6 +244,22 @@ def bomb(file):
     file['episode_1'].create_dataset('actions', (10**12, 2), 'f8', chunks=(1000, 2))
 
 
+def unwritten(file):
+    del file['episode_1/actions']
+    file['episode_1'].create_dataset('actions', (5, 2), 'f8')
+
+
+def large_chunks(file):
+    del file['episode_1/actions']
+    options = {'chunks': (1 << 23, 2), 'maxshape': (None, 2), 'compression': 'gzip'}
+    file['episode_1'].create_dataset('actions', (5, 2), 'f8', **options)
+    file['episode_1/actions'][:] = 1
+
+
+def far_number(file):
+    point_episode(file, 10**12)
+
+
 @pytest.mark.parametrize(
     ('oddity', 'message'),
     [
@@ -231,7 +267,10 @@ def bomb(file):
         (soft, 'episode_2 is a link, which is not followed'),
         (array, 'episode_2 must be a group, got an array'),
         (gap, 'episode 2 is missing of 4'),
-        (bomb, 'episode_1/actions announces 16000000000000 bytes, more than can be there'),
+        (far_number, 'episode 2 is missing of 1000000000001'),
+        (bomb, 'episode_1/actions announces 16000000000000 bytes, more than can be in the 0'),
+        (unwritten, 'episode_1/actions announces 80 bytes, more than can be in the 0 stored'),
+        (large_chunks, 'episode_1/actions holds 80 bytes in chunks of 134217728'),
     ],
 )
 def test_odd_episode_is_refused_by_name(two_episodes, oddity, message):
