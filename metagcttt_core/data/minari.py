@@ -1,4 +1,4 @@
-"""Reading Minari datasets (HDF5) of goal-reaching robots."""
+"""Reading Minari's and D4RL's datasets (HDF5) of goal-reaching robots."""
 
 import math
 from pathlib import Path
@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from metagcttt_core.data.bounds import check_announced, check_memory
+from metagcttt_core.data.checks import looks_like_a_mark
 from metagcttt_core.data.errors import DatasetError
 
 SUFFIXES = ('.hdf5', '.h5')
@@ -33,11 +34,15 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     gymnasium-robotics, become vectors that begin with the achieved goal: it is put in front unless
     `observation` begins with it anyway. `desired_goal` is left out.
 
+    A file in D4RL's layout has arrays of all rows instead, with `terminals` and `timeouts`.
+
     Args:
-        path: `main_data.hdf5`, the folder `data` that holds it, or the folder above.
+        path: `main_data.hdf5`, the folder `data` that holds it, or the folder above. Or D4RL's
+            file.
 
     Returns:
-        `observations`, `actions` and `terminals`, and `qpos` and `qvel` where it has them.
+        `observations`, `actions` and `terminals`, and `qpos` and `qvel` where it has them; of
+        D4RL's layout other marks of ends and `next_observations`, too.
 
     Raises:
         DatasetError: If there is no such dataset, it is damaged, or an episode does not fit.
@@ -51,6 +56,8 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     file_path = _file_of(path)
     try:
         with h5py.File(file_path, 'r') as file:
+            if hasattr(file.get('observations'), 'dtype'):
+                return _flat(file, file_path)
             names, episodes = _episode_names(file, path), []
             num_bytes = 0
             for name in names:
@@ -107,6 +114,21 @@ def _episode(file: Any, name: str, path: Path) -> dict[str, np.ndarray]:
     rows['actions'] = np.concatenate([actions, np.zeros_like(actions[:1])])
     rows['terminals'] = np.arange(num_rows) == num_rows - 1
     return rows
+
+
+def _flat(file: Any, path: Path) -> dict[str, np.ndarray]:
+    """The rows of a file in D4RL's layout."""
+    for required in ('actions', 'terminals'):
+        if required not in file:
+            raise DatasetError(f'{path}: has no {required}; found: {", ".join(file)}')
+    names = ['observations', 'actions', 'next_observations']
+    rows = {name: _array(file, name, path) for name in names if name in file}
+    for name in filter(looks_like_a_mark, file):
+        node = _member(file, name, path)
+        if getattr(node, 'shape', None) != (len(rows['observations']),):
+            raise DatasetError(f'{path}: {name} must have a value for each row')
+        rows[name] = _stored(node, name, path)
+    return {**rows, **_infos(file, len(rows['observations']), path)}
 
 
 def _infos(group: Any, num_rows: int, path: Path) -> dict[str, np.ndarray]:
@@ -173,6 +195,11 @@ def _array(group: Any, name: str, path: Path) -> np.ndarray:
     if not _is_table(node):
         got = f'{node.dtype} of shape {node.shape}' if hasattr(node, 'dtype') else 'a group'
         raise DatasetError(f'{path}: {name} must be numbers of shape (rows, numbers), got {got}')
+    return _stored(node, name, path)
+
+
+def _stored(node: Any, name: str, path: Path) -> np.ndarray:
+    """The content of an array, if it is there and no more than fits."""
     stored = min(node.id.get_storage_size(), path.stat().st_size)
     check_announced(node.nbytes, stored, f'{path}: {name}')
     chunk_bytes = math.prod(node.chunks or ()) * node.dtype.itemsize

@@ -413,7 +413,13 @@ class Contract(Settings):
         """What datasets and checkpoints keep of a contract; compared by `identity_fault`."""
         text = json.dumps(self.meaning, sort_keys=True)
         digest = hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
-        return {'robot': self.robot, 'fingerprint': digest, **self.meaning}
+        return {
+            'robot': self.robot,
+            'fingerprint': digest,
+            'position_dims': list(self.position_dims),
+            'epsilon': self.retrieval.epsilon if self.retrieval else None,
+            **self.meaning,
+        }
 
     @property
     def position_dims(self) -> tuple[int, ...]:
@@ -431,6 +437,11 @@ class Contract(Settings):
     def topics(self) -> list[ObservedTopic | CommandTopic]:
         """All topics, those that are read first."""
         return [*self.observe, *self.act]
+
+    @property
+    def frame_id(self) -> str:
+        """Frame of the observations: that of the first topic that names one; empty: none does."""
+        return next((topic.frame_id for topic in self.observe if topic.frame_id), '')
 
     @property
     def obs_dim(self) -> int:

@@ -1,6 +1,9 @@
 """Minari datasets: written by Minari's own API, read as rows; and what is refused."""
 
+from pathlib import Path
+import re
 import sys
+from typing import Any
 
 from gymnasium import spaces
 import h5py
@@ -274,3 +277,46 @@ def test_odd_episode_is_refused_by_name(two_episodes, oddity, message):
     oddity(two_episodes)
     with pytest.raises(DatasetError, match=rf'main_data\.hdf5: .*{message}'):
         loaded(two_episodes)
+
+
+def d4rl(path: Path, **changes: Any) -> Path:
+    """A file in D4RL's layout: a goal that was reached, then a time-out."""
+    rng = np.random.default_rng(0)
+    arrays = {
+        'observations': rng.normal(size=(9, 4)).astype(np.float32),
+        'actions': rng.uniform(-1, 1, (9, 2)).astype(np.float32),
+        'rewards': np.zeros(9, np.float32),
+        'terminals': np.arange(9) == 3,
+        'timeouts': np.arange(9) == 8,
+        'infos/qpos': rng.normal(size=(9, 2)),
+        **changes,
+    }
+    with h5py.File(path, 'w') as file:
+        for name, array in arrays.items():
+            if array is not None:
+                file[name] = array
+    return path
+
+
+def test_d4rl_file_ends_trajectories_by_terminals_and_timeouts(tmp_path):
+    dataset = TrajectoryDataset.load(d4rl(tmp_path / 'maze2d.hdf5'))
+    assert dataset.episode_ends.tolist() == [3, 8]
+    assert dataset.extras['qpos'].shape == (9, 2)
+    assert sorted(dataset.extras) == ['qpos']
+
+
+@pytest.mark.parametrize(
+    ('changes', 'error'),
+    [
+        ({'timeouts': None}, 'terminals is false on the last row'),
+        ({'terminals': None}, 'has no terminals; found: actions, infos, observations'),
+        ({'timeouts': np.zeros(8, bool)}, 'timeouts must have a value for each row'),
+        ({'timeouts': np.full(9, 2)}, 'timeouts must hold 0 or 1'),
+        ({'actions': np.zeros((8, 2))}, 'actions has 8 rows but observations has 9'),
+        ({'actions': np.zeros(9)}, 'actions must be numbers of shape'),
+    ],
+)
+def test_d4rl_file_that_does_not_fit_is_named(tmp_path, changes, error):
+    path = d4rl(tmp_path / 'maze2d.hdf5', **changes)
+    with pytest.raises(DatasetError, match=f'maze2d.hdf5: .*{re.escape(error)}'):
+        TrajectoryDataset.load(path)
