@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from metagcttt_core.data.bounds import check_announced, check_memory
-from metagcttt_core.data.checks import END_MARKS
+from metagcttt_core.data.checks import looks_like_a_mark
 from metagcttt_core.data.errors import DatasetError
 
 SUFFIXES = ('.hdf5', '.h5')
@@ -123,12 +123,11 @@ def _flat(file: Any, path: Path) -> dict[str, np.ndarray]:
             raise DatasetError(f'{path}: has no {required}; found: {", ".join(file)}')
     names = ['observations', 'actions', 'next_observations']
     rows = {name: _array(file, name, path) for name in names if name in file}
-    for name in ('terminals', *END_MARKS):
-        if name in file:
-            node = _member(file, name, path)
-            if getattr(node, 'shape', None) != (len(rows['observations']),):
-                raise DatasetError(f'{path}: {name} must have a value for each row')
-            rows[name] = np.asarray(node[()])
+    for name in filter(looks_like_a_mark, file):
+        node = _member(file, name, path)
+        if getattr(node, 'shape', None) != (len(rows['observations']),):
+            raise DatasetError(f'{path}: {name} must have a value for each row')
+        rows[name] = _stored(node, name, path)
     return {**rows, **_infos(file, len(rows['observations']), path)}
 
 
@@ -196,6 +195,11 @@ def _array(group: Any, name: str, path: Path) -> np.ndarray:
     if not _is_table(node):
         got = f'{node.dtype} of shape {node.shape}' if hasattr(node, 'dtype') else 'a group'
         raise DatasetError(f'{path}: {name} must be numbers of shape (rows, numbers), got {got}')
+    return _stored(node, name, path)
+
+
+def _stored(node: Any, name: str, path: Path) -> np.ndarray:
+    """The content of an array, if it is there and no more than fits."""
     stored = min(node.id.get_storage_size(), path.stat().st_size)
     check_announced(node.nbytes, stored, f'{path}: {name}')
     chunk_bytes = math.prod(node.chunks or ()) * node.dtype.itemsize

@@ -29,6 +29,7 @@ _DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError)
 _BAD_HEADER = (ValueError, OverflowError, TokenError)
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _LARGEST_HEADER = 12 + 10000  # NumPy reads no larger ones, but would unpack them first
+_LARGEST_TEXT = 16 << 20
 _log = logging.getLogger(__name__)
 
 
@@ -90,11 +91,10 @@ def read_json(path: Path, name: str) -> dict[str, Any] | None:
         with zipfile.ZipFile(path) as archive:
             if f'{name}.npy' not in archive.namelist():
                 return None
-            with archive.open(f'{name}.npy') as file:
-                text = np.lib.format.read_array(file, allow_pickle=False)
-        if text.ndim or text.dtype.kind != 'U':
-            raise ValueError(f'{text.dtype} of shape {text.shape}, no text')
-        content = json.loads(text.item())
+            text = _header(path, name, archive, archive.getinfo(f'{name}.npy'))
+            if text.shape or text.dtype.kind != 'U' or text.dtype.itemsize > _LARGEST_TEXT:
+                raise ValueError(f'{text.dtype} of shape {text.shape}, no short text')
+            content = json.loads(_read(path, name, archive.open(text.info)).item())
         if not isinstance(content, dict):
             raise ValueError(f'a {type(content).__name__}, no object')
     except (*_DAMAGE, *_BAD_HEADER, OSError, MemoryError, RecursionError) as error:

@@ -55,8 +55,8 @@ class _Index(Settings):
     format: str = 'metagcttt-checkpoint'
     version: int
     agent: str
-    obs_dim: int = Field(ge=1)
-    act_dim: int = Field(ge=1)
+    obs_dim: int = Field(ge=1, le=10**6)
+    act_dim: int = Field(ge=1, le=10**6)
     settings: dict[str, Any]
     metadata: dict[str, Any]
     scaling: dict[str, Any] | None = None

@@ -5,13 +5,14 @@ from functools import reduce
 from importlib import import_module
 from importlib.metadata import version
 from operator import or_
+import re
 import sys
 from typing import Annotated, Any, NamedTuple
 
 from pydantic import create_model
 import tyro
 
-from metagcttt_tools.common.cli import fail, flags_of
+from metagcttt_tools.common.cli import check_sections, fail, flags_of
 from metagcttt_tools.common.extras import EXTRAS, install_command
 
 _DESCRIPTION = """Goal-conditioned policies that adapt at test time, from data to robot.
@@ -122,7 +123,17 @@ def main(argv: list[str] | None = None) -> None:
     )
 
 
+def sections() -> list[str]:
+    """Of presets: a program's is its name with underscores."""
+    names = []
+    for name, program in PROGRAMS.items():
+        inner = [''] if isinstance(program, Program) else program.programs
+        names += [re.sub(r'\W', '_', f'{name} {part}'.strip()) for part in inner]
+    return names
+
+
 def _run(program: Program, arguments: list[str]) -> None:
+    check_sections(arguments, sections())
     try:
         _main_of(program)(arguments)
     except ModuleNotFoundError as error:

@@ -1,16 +1,18 @@
 """Command lines: defaults, then a preset, then flags; every wrong value ends with status 2."""
 
+from collections.abc import Iterator
 import importlib
 from importlib.metadata import version
 import re
 import subprocess
 import sys
+from typing import get_args
 
 from metagcttt_core.config import Settings
 from metagcttt_tools.common.cli import fail, parse, preset_values
 from metagcttt_tools.common.presets import load_preset, preset_names
 from metagcttt_tools.main import main, Program, PROGRAMS
-from pydantic import Field
+from pydantic import BaseModel, Field, ValidationError
 import pytest
 
 
@@ -124,21 +126,33 @@ def test_wrong_flag_is_refused_by_name(arguments, parts, capsys):
         (
             'toy: {steps: 0, inner: {rate: -2}}',
             [
-                'error: steps: Input should be greater than or equal to 1, got 0',
-                'error: inner.rate: Input should be greater than 0, got -2',
+                'mine.yaml: steps: Input should be greater than or equal to 1, got 0',
+                'mine.yaml: inner.rate: Input should be greater than 0, got -2',
             ],
         ),
         ('other: {}', ["has no section 'toy'; it has: other"]),
         ('toy: 5', ['toy must hold a mapping of settings, got int']),
         ('toy:', ['toy must hold a mapping of settings, got NoneType']),
         ('toy: {5: 3}', ['Toy has no setting 5']),
-        ('toy: [1', ['is not valid YAML']),
+        ('toy: [1', ['not valid YAML']),
     ],
 )
 def test_wrong_preset_is_refused_by_name(content, lines, preset, capsys):
     text = refused(capsys, '--preset', preset(content))
     assert text.startswith('error: ')
     assert all(line in text for line in lines), text
+
+
+def test_misspelt_section_is_refused_with_the_nearest_known_one(preset, monkeypatch, capsys):
+    path = preset('meta_trian: {meta: {outer_steps: 3}}')
+    for arguments in (['--preset', path], [f'--preset={path}'], []):
+        with pytest.raises(SystemExit):
+            main(['meta-train', *arguments])
+        error = capsys.readouterr().err
+        assert f"{path}: 'meta_trian' is a section of no program; did you mean 'meta_train'?" in (
+            error
+        )
+        monkeypatch.setenv('METAGCTTT_OVERRIDES', path)  # from the second time on
 
 
 def test_unknown_preset_is_refused_with_the_nearest_known_one(capsys):
@@ -196,6 +210,23 @@ def test_every_program_teaches_and_reads_the_section_of_its_name(name, monkeypat
     for field, info in model.model_fields.items():
         nested = isinstance(info.annotation, type) and issubclass(info.annotation, Settings)
         assert info.description or nested, f'{field} has no description'
+
+
+def nested_models(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
+    yield model
+    for field in model.model_fields.values():
+        for part in (field.annotation, *get_args(field.annotation)):
+            if isinstance(part, type) and issubclass(part, BaseModel):
+                yield from nested_models(part)
+
+
+@pytest.mark.parametrize('name', programs())
+def test_misspelt_setting_of_any_depth_is_refused_with_the_nearest_known_one(name, monkeypatch):
+    for model in nested_models(asked_settings(name, monkeypatch)[0]):
+        for field in model.model_fields:
+            wrong = f'{field}z'
+            with pytest.raises(ValidationError, match=rf"'{wrong}'; did you mean '{field}'"):
+                model.model_validate({wrong: 1})
 
 
 @pytest.mark.parametrize('preset_name', preset_names())

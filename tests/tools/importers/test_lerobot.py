@@ -171,6 +171,7 @@ class TestImport:
             ({'total_frames': 20}, 'counts 3 episodes and 20 frames; there are 3 and 21'),
             ({'data_path': '../{chunk_index}'}, 'data_path leads out of the folder'),
             ({'data_path': '{episode_chunk}'}, 'takes more than chunk_index and file_index'),
+            ({'data_path': f'{{file_index:{10**12}d}}'}, 'of at most 99 digits'),
         ],
     )
     def test_wrong_info_is_named(self, pusht, capsys, changes, error):

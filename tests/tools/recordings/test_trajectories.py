@@ -2,6 +2,10 @@
 
 from pathlib import Path
 
+import lz4.frame
+from mcap.data_stream import RecordBuilder
+from mcap.records import Chunk, Header
+from mcap.writer import MCAP0_MAGIC
 from mcap_ros2.writer import Writer
 from metagcttt_core.data import DatasetError
 from metagcttt_tools.recordings.trajectories import ACTION, join_datasets, read_recordings, STATE
@@ -10,6 +14,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
+import zstandard
 
 STATE_TEXT = (
     'std_msgs/Header header\nuint32 episode_id\nuint32 step\nfloat64[] observation\n'
@@ -290,6 +295,27 @@ def test_damaged_recording_is_refused(bag) -> None:
     bag.path.write_bytes(content)
     with pytest.raises(DatasetError, match=r'damaged|needs topics'):
         read_recordings([bag.path])
+
+
+@pytest.mark.parametrize('compression', ['', 'lz4', 'zstd'])
+@pytest.mark.parametrize('announced', [10, 1 << 40])
+def test_chunk_is_unpacked_only_as_far_as_it_says(
+    tmp_path, compression, announced, bounded_memory
+) -> None:
+    compress = {'': bytes, 'lz4': lz4.frame.compress, 'zstd': zstandard.compress}[compression]
+    builder = RecordBuilder()
+    Header(profile='ros2', library='').write(builder)
+    Chunk(
+        compression=compression,
+        data=compress(bytes(1 << 26)),
+        message_start_time=0,
+        message_end_time=0,
+        uncompressed_crc=0,
+        uncompressed_size=announced,
+    ).write(builder)
+    (tmp_path / 'run.mcap').write_bytes(MCAP0_MAGIC + builder.end())
+    with pytest.raises(DatasetError, match=r'does not unpack to 10|at most 268435456 are read'):
+        read_recordings([tmp_path / 'run.mcap'])
 
 
 def test_recording_without_the_topics_is_refused_with_those_it_has(bag) -> None:

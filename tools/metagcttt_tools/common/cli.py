@@ -1,6 +1,6 @@
 """Command lines from typed settings: defaults, then a preset, then flags."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextvars import ContextVar
 import os
 import re
@@ -8,6 +8,7 @@ import sys
 from typing import Annotated, Any, NoReturn, TypeVar
 
 from metagcttt_core.config import error_lines, Settings
+from metagcttt_core.config.settings import nearest_name
 from pydantic import BaseModel, ValidationError
 import tyro
 
@@ -74,7 +75,11 @@ def parse(
                 prog=f'metagcttt {program}',
             )
 
-        settings = with_flags(model.model_validate(values))
+        try:
+            default = model.model_validate(values)
+        except ValidationError as error:
+            fail(*(f'{_origin(preset.preset)}: {line}' for line in error_lines(error)))
+        settings = with_flags(default)
         if isinstance(settings, Resumable) and settings.resume:
             return continued(settings, values, with_flags)  # type: ignore[arg-type]
         return settings
@@ -94,6 +99,32 @@ def flags_of(main: Callable[[list[str]], None]) -> type[BaseModel]:
     finally:
         _only_asked.reset(token)
     raise AssertionError(f'{main.__module__} read no settings')
+
+
+def _origin(preset: str | None) -> str:
+    """Where values that no flag gave come from."""
+    overrides = os.environ.get('METAGCTTT_OVERRIDES')
+    return ' with '.join(f'preset {name}' for name in (preset, overrides) if name)
+
+
+def check_sections(arguments: Sequence[str], sections: Collection[str]) -> None:
+    """End the process if a preset that is named has a section that is of no program.
+
+    Args:
+        arguments: Of the program.
+        sections: Of all programs.
+    """
+    known, _ = tyro.cli(_Preset, args=arguments, return_unknown_args=True, add_help=False)
+    for name in (known.preset, os.environ.get('METAGCTTT_OVERRIDES')):
+        try:
+            preset = load_preset(name) if name else {}
+        except ValueError as error:
+            fail(str(error))
+        for section in preset:
+            if section not in sections:
+                near = nearest_name(str(section), sections)
+                hint = f'; did you mean {near!r}?' if near else ''
+                fail(f'preset {name}: {section!r} is a section of no program{hint}')
 
 
 def _preset_help(section: str) -> str:

@@ -1,14 +1,16 @@
 """Reading ROS messages from MCAP recordings, also from ones whose recorder was killed. No ROS."""
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 import struct
 from typing import Any, cast, IO
 
+import lz4.frame
 from mcap.exceptions import EndOfFile, InvalidMagic, McapError, RecordLengthLimitExceeded
-from mcap.records import Channel, Footer, Message, Schema
-from mcap.stream_reader import StreamReader
+from mcap.records import Channel, Chunk, Footer, McapRecord, Message, Schema
+from mcap.stream_reader import breakup_chunk, StreamReader
 from mcap.writer import MCAP0_MAGIC
 from mcap_ros2.decoder import DecoderFactory
 from metagcttt_core.data.errors import DatasetError
@@ -16,6 +18,9 @@ import zstandard
 
 BACK_NS = 10**9
 """Messages that overtake others do so by less; a clock that was set back goes further."""
+
+LARGEST_CHUNK = 256 << 20
+"""Bytes of a chunk of messages; recorders write some megabytes."""
 
 SILENCE_NS = 10 * 10**9
 """Nodes report their health every second: a longer silence is a clock set forward, or a break."""
@@ -117,6 +122,29 @@ class _File:
         return data
 
 
+def _unpacked(record: McapRecord) -> list[McapRecord]:
+    """The records in a chunk, which is unpacked only as far as it says; or the record itself.
+
+    Raises:
+        ValueError: If the chunk is larger than any recorder makes them, or not as large as it
+            says.
+    """
+    if not isinstance(record, Chunk):
+        return [record]
+    size, compression = record.uncompressed_size, record.compression
+    if size > LARGEST_CHUNK:
+        raise ValueError(f'a chunk announces {size} bytes, at most {LARGEST_CHUNK} are read')
+    data = record.data
+    if compression == 'zstd':
+        with zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True) as stream:
+            data = stream.read(size + 1)
+    elif compression == 'lz4':
+        data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+    if len(data) != size:
+        raise ValueError(f'a chunk does not unpack to {size} bytes, as it says')
+    return breakup_chunk(replace(record, compression='', data=data), validate_crc=True)
+
+
 def read_messages(path: Path, type_names: Collection[str]) -> RecordedMessages:
     """All messages of some types, decoded.
 
@@ -142,9 +170,10 @@ def read_messages(path: Path, type_names: Collection[str]) -> RecordedMessages:
             reader = StreamReader(
                 cast('IO[bytes]', _File(file)),
                 validate_crcs=True,
+                emit_chunks=True,
                 record_size_limit=max(path.stat().st_size, 8),
             )
-            for record in reader.records:
+            for record in chain.from_iterable(map(_unpacked, reader.records)):
                 if isinstance(record, Schema):
                     schemas[record.id] = record
                 elif isinstance(record, Channel):

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+import re
 from typing import Annotated, Any
 
 from metagcttt_core.config import error_lines
@@ -27,6 +28,7 @@ _EPISODE = (
     *('episode_index', 'length', 'dataset_from_index', 'dataset_to_index'),
     *('data/chunk_index', 'data/file_index'),
 )
+_INDEX = re.compile(r'\{(chunk_index|file_index)(:\d{1,2}d)?\}')
 _PICTURES = ('video', 'image')
 
 
@@ -176,13 +178,12 @@ def _read_episodes(folder: Path, info: Info) -> list[_Episode]:
 
 
 def _data_file(folder: Path, info: Info, chunk: int, file: int) -> PurePosixPath:
-    try:
-        path = PurePosixPath(info.data_path.format(chunk_index=chunk, file_index=file))
-    except (LookupError, ValueError, AttributeError) as error:
+    if '{' in _INDEX.sub('', info.data_path) or '}' in _INDEX.sub('', info.data_path):
         raise DatasetError(
             f'{folder}: meta/info.json: data_path {info.data_path!r} takes more than chunk_index '
-            f'and file_index ({error})'
-        ) from error
+            'and file_index, of at most 99 digits'
+        )
+    path = PurePosixPath(info.data_path.format(chunk_index=chunk, file_index=file))
     if path.is_absolute() or '..' in path.parts:
         raise DatasetError(f'{folder}: meta/info.json: data_path leads out of the folder: {path}')
     return path
