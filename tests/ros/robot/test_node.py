@@ -54,6 +54,7 @@ class Rig:
         graph.wait(self._odometry.get_subscription_count, 'the bridge')
         graph.wait(self._actions.get_subscription_count, 'the bridge')
         self.values, self.query_id, self._answered = [1.0, 0.5], 7, 0
+        self.withheld = False
 
     def send_odometry(self, late_s: float = 0.0, **fields) -> None:
         now_ns = self.graph.node.get_clock().now().nanoseconds
@@ -66,6 +67,7 @@ class Rig:
                 step=self.states[-1].step if step is None else step,
                 query_id=self.query_id,
                 values=self.values,
+                withheld=self.withheld,
                 instance=instance,
             )
         )
@@ -134,7 +136,7 @@ def test_silent_policy_stops_the_robot_until_it_returns(rig: Rig) -> None:
 
 @pytest.mark.parametrize(
     ('change', 'reason'),
-    [({'query_id': 0}, 'no goal'), ({'values': [0.0, 0.0]}, 'the policy keeps the robot still')],
+    [({'query_id': 0}, 'no goal'), ({'withheld': True}, 'the policy keeps the robot still')],
 )
 def test_robot_stands_without_a_goal_and_when_the_policy_says_so(
     rig: Rig, change: dict, reason: str
@@ -204,6 +206,15 @@ def test_second_publisher_of_commands_stops_the_robot_until_it_is_gone(rig: Rig)
     rig.drive()
 
 
+def test_topic_of_another_type_is_named(rig: Rig) -> None:
+    rig.graph.node.destroy_publisher(rig._odometry)
+    other = Graph(rig.graph.context.get_domain_id())  # one participant has one type a topic
+    other.node.create_publisher(Twist, 'odom', RELIABLE)
+    reason = 'odom is published as geometry_msgs/msg/Twist, not nav_msgs/msg/Odometry'
+    rig.drive_until(lambda: rig.is_named(reason), reason, observe=False)
+    other.close()
+
+
 def test_second_policy_stops_the_robot(rig: Rig) -> None:
     rig.drive()
     rig.answer(instance=2)
@@ -269,7 +280,7 @@ def test_commands_stay_within_limits_and_reach_whatever_happens(rig: Rig) -> Non
 def test_joints_are_mapped_by_name_and_start_where_they_are(graph: Graph, tmp_path: Path) -> None:
     file = tmp_path / 'arm.yaml'
     file.write_text(ARM)
-    graph.add(RobotBridgeNode, contract=str(file))
+    bridge = graph.add(RobotBridgeNode, contract=str(file))
     states = graph.collect(MazeState, 'state', ANY)
     targets = graph.collect(Float64MultiArray, 'targets', RELIABLE)
     joints = graph.node.create_publisher(JointState, 'joint_states', RELIABLE)
@@ -288,6 +299,12 @@ def test_joints_are_mapped_by_name_and_start_where_they_are(graph: Graph, tmp_pa
     graph.wait(move, 'a target')
     assert list(states[0].observation) == [0.5, -1.0]
     np.testing.assert_allclose(targets[0].data, [-0.9, 0.6])  # b, a: a tenth of a second on
+
+    def lose_a_joint() -> bool:
+        joints.publish(JointState(name=['b', 'gripper'], position=[-1.0, 0.3]))
+        return 'joint_states: no joint a' in bridge._faults._newest[0]
+
+    graph.wait(lose_a_joint, 'the fault')
 
 
 @pytest.mark.parametrize(

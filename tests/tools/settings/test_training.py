@@ -75,6 +75,7 @@ PRETRAIN = Walk(
         **RUN,
         'environment': 'pointmaze-large-v0',
         'agent': 'gciql',
+        'standardise': 'yes',
         'hidden': [4],
         'gcbc.const_std': False,
         'gcbc.discount': Proof(0.5, {'gcbc.goals.value': None, **GEOMETRIC}),

@@ -67,12 +67,15 @@ class PolicyNode(ConventionalNode, LifecycleNode):
         """Load policy and dataset, and connect; a failure leaves the node unconfigured."""
         config = FilterConfig(
             variant=self._settings['filter_variant'],
-            epsilon=self._settings['epsilon'],
+            epsilon=self._settings['epsilon'] or 1.0,
             top_percent=self._settings['top_percent'],
         )
         try:
             deployment = load_deployment(
-                self._settings['checkpoint'], self._settings['dataset'], config
+                self._settings['checkpoint'],
+                self._settings['dataset'],
+                config,
+                epsilon_of_contract=not self._settings['epsilon'],
             )
             deployment.check_optimizer_state(self._settings['optimizer_state'])
             engine = warm_up(deployment, inner_loop(self._settings))

@@ -37,9 +37,10 @@ LEVELS = {'fault': Level.ERROR, 'stop': Level.WARN, 'silent': Level.WARN}
 class RobotBridgeNode(ConventionalNode):
     """Publishes a robot's state at the rate of its contract, and the policy's actions as commands.
 
-    A robot is never reset, so there is one episode. Observations go by the node's clock; deadlines
-    of commands go by a steady one, as simulated time may stand still. Where simulated time goes
-    back, the simulation was started again: that is another world, in which no goal is in force.
+    A robot is never reset, so there is one episode. Observations go by the node's clock, with
+    which the contract's `stamp: header` compares the robot's; deadlines of commands go by a steady
+    one, as simulated time may stand still. Where simulated time goes back, the simulation was
+    started again: that is another world, in which no goal is in force.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -56,6 +57,7 @@ class RobotBridgeNode(ConventionalNode):
         self._contract = load_contract(Path(self._settings['contract']).expanduser())
         if faults := type_faults(self._contract, definitions):
             raise ContractError('\n'.join(faults))
+        self._fingerprint = self._contract.identity['fingerprint']
         self._observer = Observer(self._contract)
         self._pilot = Pilot(self._contract)
         self._begin_world()
@@ -68,7 +70,6 @@ class RobotBridgeNode(ConventionalNode):
         self._rate = Rate()
         self._step = 0
         self._ended = False
-        self._frame = next((t.frame_id for t in self._contract.observe if t.frame_id), '')
 
         self._states = self.create_publisher(MazeState, 'state', keep_several(SENSOR))
         self._stamped = [has_header(topic.type, definitions) for topic in self._contract.act]
@@ -138,7 +139,9 @@ class RobotBridgeNode(ConventionalNode):
         if message.episode_id != EPISODE:
             self._note('refused_actions', f'the action is for episode {message.episode_id}')
             return
-        refusal = self._pilot.take_action(message.step, message.query_id, to_array(message.values))
+        refusal = self._pilot.take_action(
+            message.step, message.query_id, to_array(message.values), withheld=message.withheld
+        )
         if refusal:
             self._note('refused_actions', refusal)
         else:
@@ -179,7 +182,7 @@ class RobotBridgeNode(ConventionalNode):
         self._pilot.saw_observation(self._step, observation, time.monotonic_ns())
         self._rate.add(time.monotonic())
         x, y = self._position(observation)
-        header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self._frame)
+        header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self._contract.frame_id)
         self._states.publish(
             state_message(
                 header,
@@ -191,6 +194,7 @@ class RobotBridgeNode(ConventionalNode):
                 terminated=False,
                 truncated=False,
                 success=False,
+                contract=self._fingerprint,
             )
         )
 
@@ -211,6 +215,17 @@ class RobotBridgeNode(ConventionalNode):
         for publisher in self._commands:
             if self.count_publishers(publisher.topic_name) > 1:
                 return f'others publish on {publisher.topic_name}'
+        return ''
+
+    def _strangers(self) -> str:
+        """Who publishes what is observed as another type, which never arrives; or empty."""
+        for topic in self._contract.observe:
+            name = self.resolve_topic_name(topic.topic)
+            types = {each.topic_type for each in self.get_publishers_info_by_topic(name)}
+            if types and topic.type not in types:
+                return (
+                    f'{topic.topic} is published as {", ".join(sorted(types))}, not {topic.type}'
+                )
         return ''
 
     def _send(self, number: int, command: NDArray[np.float64]) -> None:
@@ -235,11 +250,12 @@ class RobotBridgeNode(ConventionalNode):
         now_ns = time.monotonic_ns()
         found = [(t.topic, self._pilot.situation(t, now_ns)) for t in self._contract.act]
         worst = max((s for _, s in found), key=lambda s: LEVELS.get(s.case, Level.OK))
+        strangers = self._strangers() if self._observer.late else ''
         recent = self._faults.recent(now_ns / 1e9)
         level = LEVELS.get(worst.case, Level.WARN if recent else Level.OK)
         return Health(
             level,
-            worst.reason or recent or 'the policy commands',
+            strangers or worst.reason or recent or 'the policy commands',
             {
                 'state_rate_hz': f'{self._rate.per_second(now_ns / 1e9):.1f}',
                 **{topic: _in_words(situation) for topic, situation in found},
