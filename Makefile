@@ -42,8 +42,9 @@ lint: setup ## check style, formatting and types
 wheel: setup ## build the wheel and try it in a fresh environment
 	@tools/check_wheel.sh
 
-docs: setup ## build the documentation site; warnings are errors
+docs: setup ## build the documentation site; warnings and broken links are errors
 	@.venv/bin/sphinx-build -q -W --keep-going -b html -c docs . docs/_build
+	@$(PYTHON) tools/check_site.py docs/_build
 	@echo docs/_build/docs/index.html
 
 release: wheel ## build what is uploaded, sdist and wheel, and check their descriptions

@@ -80,6 +80,7 @@ def test_misspelt_agent_is_refused_with_the_known_ones(tmp_path, guests) -> None
 SCRIPTS = {
     'adapt.py': (),
     'own_data.py': (),
+    'policy_loop.py': (),
     'animate_adaptation.py': ('out/adaptation.gif',),
 }
 
@@ -102,6 +103,8 @@ def test_example_does_what_it_shows(name: str, tmp_path: Path) -> None:
     if name == 'own_data.py':
         base, _, adapted = numbers
         assert adapted < 1 < base
+    if name == 'policy_loop.py':
+        assert run.stdout.count('reached') >= 4
     if name == 'animate_adaptation.py':
         with Image.open(tmp_path / 'out' / 'adaptation.gif') as film:
             assert film.n_frames > 10

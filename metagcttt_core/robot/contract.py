@@ -55,7 +55,10 @@ class Numbers(Settings):
         "by the message's own `name` where it has one",
     )
     size: int | None = Field(
-        None, ge=1, description='length of a field that is an array without names of joints'
+        None,
+        ge=1,
+        le=10000,
+        description='length of a field that is an array without names of joints',
     )
 
     @model_validator(mode='after')

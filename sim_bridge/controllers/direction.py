@@ -12,10 +12,14 @@ from sim_bridge.controllers.follower import (
 )
 from sim_bridge.controllers.humanoid import HumanoidFollower
 from sim_bridge.controllers.learned import LearnedFollower
+from sim_bridge.controllers.rising import RisingHumanoid
 from sim_bridge.simulator import SimulatorSpec
 
 BUNDLED = Path(__file__).with_name('weights')
 """Folder of the learned controllers that come with the package, one folder a robot."""
+
+GET_UP = BUNDLED / 'humanoid-get-up'
+"""Folder of the controller that makes the humanoid stand."""
 
 _UNLEARNED: dict[str, type[DirectionFollower]] = {
     'pointmaze': PointFollower,
@@ -36,8 +40,9 @@ def make_direction_follower(
 
     Args:
         spec: The simulator whose robot it shall drive.
-        controller: Folder of a learned controller, as `tools.train_controller` writes it; by
-            default the one that comes with the package, if the robot needs one.
+        controller: Folder of a learned controller, as `metagcttt controller` writes it; by
+            default the one that comes with the package, if the robot needs one. A humanoid's
+            walks; what makes it get up comes with the package.
 
     Raises:
         ControllerError: If the robot needs a learned controller and there is none, or the given
@@ -45,7 +50,10 @@ def make_direction_follower(
     """
     family = re.split('[-_]', spec.name)[0]
     if family in _LEARNED:
-        return _learned(spec, _LEARNED[family], controller)
+        follower = _learned(spec, _LEARNED[family], controller)
+        if isinstance(follower, HumanoidFollower):
+            return RisingHumanoid(follower, HumanoidFollower.load(GET_UP))
+        return follower
     if family not in _UNLEARNED:
         raise ControllerError(
             f'{spec.name}: there is no controller for its robot; data can be generated for '

@@ -6,6 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from sim_bridge.controllers.follower import DirectionFollower
+from sim_bridge.controllers.humanoid import head_height
+from sim_bridge.controllers.humanoid_get_up import STANDING_HEAD_M
 from sim_bridge.controllers.learned import LearnedFollower
 from sim_bridge.controllers.posture import count_falls, has_fallen
 from sim_bridge.mazes.ogbench import OGBenchMaze, open_floor, standing_pose
@@ -112,38 +115,59 @@ def walk_along(
 
 @dataclass(frozen=True)
 class GoalRun:
-    """One task of a maze, walked until the goal, a fall or the step limit.
+    """One task of a maze, walked until the goal, the step limit or, started upright, a fall.
 
     Attributes:
         reached: The goal was reached.
-        fallen: The robot fell on the way.
+        falls: How often the robot fell on the way; dropped, the first time is the drop.
         duration_s: Simulated seconds.
     """
 
     reached: bool
-    fallen: bool
+    falls: int
     duration_s: float
 
 
 def walk_to_goal(
-    follower: LearnedFollower, maze: OGBenchMaze, task_id: int, seed: int, action_noise: float
+    follower: DirectionFollower,
+    maze: OGBenchMaze,
+    task_id: int,
+    seed: int,
+    action_noise: float,
+    dropped: bool = False,
 ) -> GoalRun:
-    """Walk a task along the shortest way through the cells, starting upright."""
-    _, goal = maze.reset(task_id, seed)
+    """Walk a task along the shortest way through the cells.
+
+    The robot starts upright and ends with its first fall; `dropped`, it starts as OGBench starts
+    it, and may get up.
+    """
+    observation, goal = maze.reset(task_id, seed)
     goal_xy = float(goal[0]), float(goal[1])
-    observation = maze.stand()
+    if not dropped:
+        observation = maze.stand()
     rng = np.random.default_rng(seed)
-    steps = 0
+    qpos = [maze.qpos]
     while True:
         target = maze.maze.waypoint(maze.maze.cell(*maze.position), goal_xy)
         offset = np.subtract(target, maze.position)
-        action = follower.act(observation, offset / np.linalg.norm(offset), maze.qpos)
+        action = follower.act(observation, offset / np.linalg.norm(offset), qpos[-1])
         result = maze.step(action + rng.normal(0.0, action_noise, action.shape))
         observation = result.observation
-        steps += 1
-        fallen = bool(has_fallen(maze.qpos)) and not result.terminated
+        qpos.append(maze.qpos)
+        fallen = bool(has_fallen(qpos[-1])) and not dropped
         if result.terminated or result.truncated or fallen:
-            return GoalRun(result.terminated, fallen, steps * maze.spec.control_period_s)
+            falls = count_falls(np.array(qpos[: -1 if result.terminated else None]))
+            duration_s = (len(qpos) - 1) * maze.spec.control_period_s
+            return GoalRun(result.terminated, falls, duration_s)
+
+
+def stands_up(follower: DirectionFollower, maze: OGBenchMaze, seed: int, within_s: float) -> bool:
+    """Whether a humanoid stands a while after OGBench's start of a task, told to go nowhere."""
+    observation, _ = maze.reset(seed % len(maze.tasks) + 1, seed)
+    for _ in range(round(within_s / maze.spec.control_period_s)):
+        action = follower.act(observation, np.zeros(2), maze.qpos)
+        observation = maze.step(action).observation
+    return bool(head_height(observation) > STANDING_HEAD_M)
 
 
 def _stand_up(environment: Any, rng: np.random.Generator) -> None:

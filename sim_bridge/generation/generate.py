@@ -3,15 +3,14 @@
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
-import json
 from pathlib import Path
 from typing import Any
 
 from metagcttt_core.data import TrajectoryDataset
-from metagcttt_core.files import write_json
+from metagcttt_core.files import read_json, write_json
 import numpy as np
 
-from sim_bridge.controllers import DirectionFollower, LearnedFollower, make_direction_follower
+from sim_bridge.controllers import DirectionFollower, make_direction_follower
 from sim_bridge.controllers.posture import count_falls
 from sim_bridge.generation.chunks import (
     Chunk,
@@ -159,9 +158,8 @@ def kept_settings(output: Path) -> tuple[Path, dict[str, Any]] | None:
 
 def _settings(plan: GenerationPlan, follower: DirectionFollower) -> dict[str, Any]:
     """All settings that determine the content of a dataset."""
-    controller = (
-        {'controller_sha256': follower.sha256} if isinstance(follower, LearnedFollower) else {}
-    )
+    sha256 = getattr(follower, 'sha256', None)  # of learned weights
+    controller = {'controller_sha256': sha256} if sha256 else {}
     versions = {f'{package}_version': version(package) for package in PHYSICS_PACKAGES}
     settings = plan.model_dump(exclude_defaults=True)
     return {'format_version': FORMAT_VERSION, **settings, **controller, **versions}
@@ -187,7 +185,7 @@ def _finished(sidecar: Path, settings: dict[str, Any]) -> DatasetStatistics:
 def _stored(sidecar: Path) -> tuple[dict[str, Any], DatasetStatistics]:
     """Settings and statistics of a complete dataset."""
     try:
-        stored = json.loads(sidecar.read_text(encoding='utf-8'))
+        stored = read_json(sidecar)
         return stored, DatasetStatistics(**stored.pop('statistics'))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise GenerationError(

@@ -26,7 +26,9 @@ class GenerationPlan(BaseModel):
     noise: float = Field(ge=0, description='Standard deviation of the action noise.')
     seed: int = Field(ge=0, description='Random seed.')
     to_goal: bool = Field(False, description="Walk to the goal, not to its cell's center.")
-    cut_falls: bool = Field(False, description='End an episode a second before a fall.')
+    standing: bool = Field(
+        False, description='Humanoids start on their feet and end a second before a fall.'
+    )
 
     @property
     def validation_episodes(self) -> int:
@@ -47,14 +49,14 @@ def plan_dataset(
     rows_per_episode: int | None = None,
     noise: float | None = None,
     to_goal: bool = False,
+    standing: bool = False,
 ) -> GenerationPlan:
     """Plan a dataset, with OGBench's size and noise by default.
 
     Mazes of gymnasium-robotics, for which OGBench has no data, get those of its point maze.
-    Humanoids cannot get up, so their episodes end before a fall.
 
     Raises:
-        ValueError: If the environment is unknown.
+        ValueError: If the environment is unknown, or has no humanoid that could start standing.
         pydantic.ValidationError: If a number is out of range.
 
     Example:
@@ -63,6 +65,8 @@ def plan_dataset(
         (5000, 201, 0.5)
     """
     name = describe_environment(environment).spec.name
+    if standing and not name.startswith('humanoidmaze'):
+        raise ValueError(f'{name}: only humanoids have a standing start')
     usual = _ogbench_size(name if '_' not in name else 'pointmaze-medium-v0', kind)
     asked = {'episodes': episodes, 'rows_per_episode': rows_per_episode, 'noise': noise}
     given = {key: value for key, value in asked.items() if value is not None}
@@ -71,7 +75,7 @@ def plan_dataset(
         kind=kind,
         seed=seed,
         to_goal=to_goal,
-        cut_falls=name.startswith('humanoidmaze'),
+        standing=standing,
         **{**usual, **given},
     )
 

@@ -57,7 +57,7 @@ def record_chunks(
 def _record(
     plan: GenerationPlan, chunk: Chunk, folder: ChunkFolder, controller: Path | None
 ) -> Chunk:
-    simulator, follower = _workbench(plan.environment, controller)
+    simulator, follower = _workbench(plan.environment, plan.standing, controller)
     episodes = [
         record_episode(
             simulator,
@@ -67,7 +67,7 @@ def _record(
             plan.noise,
             episode_generator(plan.seed, chunk.validation, index),
             plan.to_goal,
-            plan.cut_falls,
+            plan.standing,
         )
         for index in range(chunk.start, chunk.stop)
     ]
@@ -76,9 +76,11 @@ def _record(
 
 
 @cache
-def _workbench(environment: str, controller: Path | None) -> tuple[Simulator, DirectionFollower]:
+def _workbench(
+    environment: str, standing: bool, controller: Path | None
+) -> tuple[Simulator, DirectionFollower]:
     """Simulator and controller, built once per process."""
-    simulator = make_simulator(environment)
+    simulator = make_simulator(environment, standing=standing)
     return simulator, make_direction_follower(simulator.spec, controller)
 
 

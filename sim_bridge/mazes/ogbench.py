@@ -143,14 +143,13 @@ class OGBenchMaze(GymMaze):
         if start_xy is not None:
             self._env.set_xy(np.array(start_xy, dtype=np.float64))
             observation = self._env.get_ob()
-        return self.stand() if self._is_humanoid else observation
+        return self.stand() if self._standing else observation
 
     def stand(self) -> Array:
         """Put the humanoid on its feet where it is and return the observation.
 
-        OGBench starts its tasks with a humanoid in a random pose that falls to the floor, and
-        none of its datasets or of our controllers shows how to get up. Other robots start
-        upright and are left as they are.
+        OGBench starts its tasks with a humanoid in a random pose that falls to the floor. Other
+        robots start upright and are left as they are.
         """
         if self._is_humanoid:
             qpos, _ = standing_pose(self.position, self._noise)

@@ -56,6 +56,10 @@ def commands_of_the_documents() -> list[str]:
     return sorted(line for line in lines if re.match(r'(tools/ros2run|metagcttt) ', line))
 
 
+def python_blocks() -> list[str]:
+    return re.findall(r'^```python\n(.*?)^```', README.read_text(encoding='utf-8'), re.M | re.S)
+
+
 @pytest.mark.slow
 def test_documented_nodes_record_what_documented_programs_read(
     ros_domain: int, tmp_path: Path
@@ -78,15 +82,12 @@ def test_documented_nodes_record_what_documented_programs_read(
         while not (tmp_path / 'run.mcap').exists():  # it subscribes at once
             assert time.monotonic() < deadline
             time.sleep(0.05)
-        drive = (
-            'import rclpy; from metagcttt.commander import RobotCommander\n'
-            'rclpy.init(); robot = RobotCommander(); robot.set_task(1, seed=0)\n'
-            'print(robot.reach((20.0, 20.0), max_steps=60).steps)'
-        )
-        driven = subprocess.run(
-            [sys.executable, '-c', drive], env=environment, capture_output=True, text=True
-        )
-        assert driven.stdout == '60\n', driven.stderr
+        for block, outcome in zip(python_blocks(), ('', 'True '), strict=True):
+            driven = subprocess.run(
+                [sys.executable, '-c', block], env=environment, capture_output=True, text=True
+            )
+            assert driven.returncode == 0, driven.stderr
+            assert driven.stdout.startswith(outcome), driven.stdout + driven.stderr
         client = [sys.executable, str(ROOT / 'examples' / 'ros_client.py')]
         for goal, outcome in (('20', 'reached after '), ('-9', 'not reached: ')):
             driven = subprocess.run(

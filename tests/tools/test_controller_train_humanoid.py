@@ -10,6 +10,8 @@ import numpy as np
 from PIL import Image
 import pytest
 from sim_bridge.controllers import HumanoidFollower, load_follower
+from sim_bridge.controllers.direction import GET_UP
+from sim_bridge.controllers.rising import RisingHumanoid
 
 pytestmark = pytest.mark.mujoco
 
@@ -70,7 +72,7 @@ def test_controller_makes_data_that_end_before_a_fall(trained: Path, tmp_path: P
         [
             *('--environment', 'humanoidmaze-medium-v0', '--episodes', '2', '--processes', '1'),
             *('--controller', str(trained / 'controller'), '--rows-per-episode', '200'),
-            *('--output', str(tmp_path / 'humanoid.npz')),
+            *('--output', str(tmp_path / 'humanoid.npz'), '--standing'),
         ]
     )
     dataset = TrajectoryDataset.load(tmp_path / 'humanoid.npz')
@@ -80,8 +82,13 @@ def test_controller_makes_data_that_end_before_a_fall(trained: Path, tmp_path: P
     assert dataset.observations[:, 23].min() > 0.9
     np.testing.assert_allclose(dataset.observations[dataset.episode_starts, 23], 1.49, atol=0.01)
     sidecar = json.loads((tmp_path / 'humanoid.json').read_text())
-    assert sidecar['cut_falls'] is True
-    assert sidecar['controller_sha256'] == load_follower(trained / 'controller').sha256
+    assert sidecar['standing'] is True
+    assert (
+        sidecar['controller_sha256']
+        == RisingHumanoid(
+            HumanoidFollower.load(trained / 'controller'), HumanoidFollower.load(GET_UP)
+        ).sha256
+    )
     assert sidecar['statistics']['falls_per_episode'] == 0
 
 

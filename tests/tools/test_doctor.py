@@ -95,3 +95,24 @@ def test_silence_on_the_domain_is_told(monkeypatch) -> None:
 def test_domain_that_is_none_is_named(monkeypatch, domain: str) -> None:
     monkeypatch.setenv('ROS_DOMAIN_ID', domain)
     assert doctor.discovery().found == f'ROS_DOMAIN_ID is {domain!r}'
+
+
+def test_ros_without_the_workspace_is_told(monkeypatch) -> None:
+    monkeypatch.setattr(doctor, '_imports', lambda name: not name.startswith('metagcttt'))
+    assert doctor.ros() == ('ROS 2', 'without metagcttt_interfaces, metagcttt', 'make setup')
+    monkeypatch.setattr(doctor, '_imports', lambda name: False)
+    assert doctor.discovery() == ('DDS discovery', 'without rclpy', 'make setup')
+
+
+def test_gpu_that_pytorch_does_not_see_is_told(monkeypatch) -> None:
+    monkeypatch.setattr('torch.cuda.device_count', lambda: 0)
+    monkeypatch.setattr(shutil, 'which', lambda tool: f'/usr/bin/{tool}')
+    assert doctor.torch().mend.startswith('this PyTorch sees no GPU')
+    monkeypatch.setattr(shutil, 'which', lambda tool: None)
+    assert doctor.torch().mend == ''
+
+
+@pytest.mark.mujoco
+def test_machine_without_mujoco_is_told_what_to_install(monkeypatch) -> None:
+    monkeypatch.setattr(doctor, 'find_spec', lambda name: None)
+    assert doctor.rendering().mend == 'pip install "metagcttt-core[mazes]"'

@@ -40,14 +40,16 @@ def test_default_output_is_named_as_ogbench_names_it(capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.parametrize(
-    ('environment', 'name'),
+    ('standing', 'name'),
     [
-        ('antmaze-large-v0', 'antmaze-large-stitch-v0'),
-        ('humanoidmaze-medium-v0', 'humanoidmaze-medium-stitch-standing-v0'),
+        (False, 'humanoidmaze-medium-stitch-v0'),
+        (True, 'humanoidmaze-medium-stitch-standing-v0'),
     ],
 )
-def test_data_of_a_humanoid_say_how_it_starts(environment: str, name: str) -> None:
-    settings = generate.GenerateSettings(environment=environment, kind='stitch')
+def test_data_of_a_humanoid_say_how_it_starts(standing: bool, name: str) -> None:
+    settings = generate.GenerateSettings(
+        environment='humanoidmaze-medium-v0', kind='stitch', standing=standing
+    )
     assert settings.file == Path(f'data/{name}.npz')
 
 
@@ -73,11 +75,13 @@ def test_flags_reach_the_plan() -> None:
             [
                 '--environment',
                 'humanoidmaze-medium-v0',
+                '--standing',
                 '--output',
                 'humanoidmaze-medium-navigate-v0.npz',
             ],
             "humanoidmaze-medium-navigate-v0.npz: is the name of OGBench's data",
         ),
+        (['--standing'], 'only humanoids have a standing start'),
         (['--output', 'here.zip'], 'must end in .npz, got here.zip'),
         (['--kind', 'play'], 'play'),
         (['--episodes', '0'], 'episodes'),

@@ -8,10 +8,12 @@ from metagcttt_core.config import Settings
 from metagcttt_core.files import write_json
 import numpy as np
 from pydantic import Field
-from sim_bridge.controllers import LearnedFollower, load_follower
-from sim_bridge.controllers.direction import BUNDLED
+from sim_bridge.controllers import HumanoidFollower, LearnedFollower, load_follower
+from sim_bridge.controllers.direction import BUNDLED, GET_UP
+from sim_bridge.controllers.rising import RisingHumanoid
 from sim_bridge.controllers.walk import (
     QUARTER_TURNS_RAD,
+    stands_up,
     TURN_EVERY_S,
     Walk,
     walk_along,
@@ -31,7 +33,8 @@ _DESCRIPTION = """Measure how well a learned controller follows directions.
 Example: metagcttt controller measure --controller out/humanoid-controller/controller
 Walks along each direction on an open floor; then as long straight on and with turns by 0 or 90
 degrees every 2.5 s, each without and with noisy actions; then to the goals of the robot's mazes
-by the shortest way, where a fall ends an episode. All start upright in random poses.
+by the shortest way, where a fall ends an episode. All start upright in random poses. A humanoid is
+also dropped as OGBench drops it, to get up, and to go to the same goals, up again after each fall.
 Prints tables and writes OUT.json, OUT.md and OUT.png, and with --gif a picture of it walking."""
 
 
@@ -44,6 +47,7 @@ class MeasureSettings(Settings):
     repeats: int = Field(5, ge=1, description='walks per direction, each from another pose')
     walks: int = Field(20, ge=1, description='walks straight on or with turns')
     mazes: tuple[str, ...] = Field(('medium', 'large'), description='layouts to reach goals in')
+    drops: int = Field(30, ge=1, description='of a humanoid, that shall get up')
     episodes_per_task: int = Field(2, ge=1, description='in each maze')
     action_noise: float = Field(0.2, ge=0, description='standard deviation in the noisy rows')
     seed: int = Field(0, ge=0, description='random seed')
@@ -60,6 +64,7 @@ def main(argv: list[str] | None = None) -> None:
         follower = load_follower(settings.controller)
     except ValueError as error:
         fail(str(error))
+    rising = isinstance(follower, HumanoidFollower)
     walks = [
         [
             walk_along(follower, direction, settings.duration_s, settings.seed + repeat)
@@ -74,9 +79,11 @@ def main(argv: list[str] | None = None) -> None:
             for turns in ((), QUARTER_TURNS_RAD)
             for noise in (0.0, settings.action_noise)
         ],
+        'rises': [summarize_rises(settings)] if rising else [],
         'mazes': [
-            summarize_goals(follower, settings, layout, noise)
+            summarize_goals(follower, settings, layout, noise, dropped)
             for layout in settings.mazes
+            for dropped in ((False, True) if rising else (False,))
             for noise in (0.0, settings.action_noise)
         ],
     }
@@ -145,21 +152,50 @@ def summarize_walks(
     }
 
 
+def summarize_rises(settings: MeasureSettings) -> dict[str, Any]:
+    """How often the humanoid stands after OGBench's drop."""
+    riser = HumanoidFollower.load(GET_UP)
+    maze = OGBenchMaze('humanoidmaze-medium-v0')
+    with maze:
+        stood = {
+            f'stood_after_{within_s}_s': sum(
+                stands_up(riser, maze, settings.seed + number, within_s)
+                for number in range(settings.drops)
+            )
+            for within_s in (5, 10)
+        }
+    return {'drops': settings.drops, **stood, 'controller_sha256': riser.sha256}
+
+
 def summarize_goals(
-    follower: LearnedFollower, settings: MeasureSettings, layout: str, action_noise: float
+    follower: LearnedFollower,
+    settings: MeasureSettings,
+    layout: str,
+    action_noise: float,
+    dropped: bool,
 ) -> dict[str, Any]:
-    """The figures of the tasks of a maze."""
+    """The figures of the tasks of a maze, `dropped` with a humanoid that gets up."""
     maze = OGBenchMaze(f'{follower.robot}maze-{layout}-v0')
     with maze:
         runs = [
-            walk_to_goal(follower, maze, task.task_id, settings.seed + number, action_noise)
+            walk_to_goal(
+                RisingHumanoid(follower, HumanoidFollower.load(GET_UP))
+                if isinstance(follower, HumanoidFollower)
+                else follower,
+                maze,
+                task.task_id,
+                settings.seed + number,
+                action_noise,
+                dropped,
+            )
             for task in maze.tasks
             for number in range(settings.episodes_per_task)
         ]
     durations = [run.duration_s for run in runs if run.reached]
-    falls, walked_s = sum(run.fallen for run in runs), sum(run.duration_s for run in runs)
+    falls, walked_s = sum(run.falls for run in runs), sum(run.duration_s for run in runs)
     return {
         'maze': f'{follower.robot}maze-{layout}-v0',
+        'start': 'dropped' if dropped else 'upright',
         'action_noise': action_noise,
         'reached': len(durations),
         'episodes': len(runs),
@@ -196,6 +232,7 @@ def format_tables(tables: dict[str, list[dict[str, Any]]]) -> str:
     mazes = [
         {
             'maze': row['maze'],
+            'start': row['start'],
             'action noise': f'{row["action_noise"]:g}',
             'goals': f'{row["reached"]} of {row["episodes"]}',
             'seconds to goal': 'never' if not row['reached'] else f'{row["seconds_to_goal"]:.1f}',
@@ -203,7 +240,15 @@ def format_tables(tables: dict[str, list[dict[str, Any]]]) -> str:
         }
         for row in tables['mazes']
     ]
-    return '\n\n'.join(markdown_table(rows) for rows in (directions, walks, mazes) if rows) + '\n'
+    rises = [
+        {
+            'start': 'dropped as by OGBench',
+            'stands after 5 s': f'{row["stood_after_5_s"]} of {row["drops"]}',
+            'after 10 s': f'{row["stood_after_10_s"]} of {row["drops"]}',
+        }
+        for row in tables['rises']
+    ]
+    return '\n\n'.join(map(markdown_table, filter(None, (directions, walks, rises, mazes)))) + '\n'
 
 
 def _falls(row: dict[str, Any]) -> dict[str, str]:

@@ -96,6 +96,7 @@ def drive_by_hand(settings: DemoSettings) -> None:
     from metagcttt_tools.graph.process import NodeProcess
     from metagcttt_tools.live.view import show
 
+    print(f'starting simulator, goal node and policy (logs: {settings.out / "logs"})', flush=True)
     with own_domain(), ExitStack() as stack:
         nodes = [
             stack.enter_context(NodeProcess(name, given, settings.out / 'logs' / f'{name}.log'))

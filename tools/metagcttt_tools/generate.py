@@ -38,8 +38,9 @@ writes data/pointmaze-medium-navigate-v0.npz, ...-val.npz (a tenth as many episo
 ...-v0.json (settings, versions, statistics) and ...-v0.png (where the robot has been).
 
 Ant and humanoid walk by the controllers in sim_bridge/controllers/weights; --controller takes
-another. The humanoid starts on its feet, and its episodes end a second before a fall; its data are
-named MAZE-KIND-standing-v0.
+another. The humanoid is dropped as OGBench drops it, and gets up, then and after falls; with
+--standing it starts on its feet, its episodes end a second before a fall, and its data are named
+MAZE-KIND-standing-v0.
 Where there is a network, metagcttt download fetches OGBench's published files instead."""
 
 
@@ -64,11 +65,15 @@ class GenerateSettings(Resumable):
         False,
         description="Walk to the goal itself; OGBench walks to the center of the goal's cell.",
     )
+    standing: bool = Field(
+        False,
+        description='Start a humanoid on its feet, and end its episodes a second before a fall.',
+    )
     seed: int = Field(0, ge=0, description='Random seed.')
     output: Path | None = Field(
         None,
-        description='Path ending in .npz; by default data/MAZE-KIND-v0.npz, for a humanoid '
-        'data/MAZE-KIND-standing-v0.npz.',
+        description='Path ending in .npz; by default data/MAZE-KIND-v0.npz, with '
+        '--standing data/MAZE-KIND-standing-v0.npz.',
     )
     processes: int = Field(
         default_factory=lambda: len(os.sched_getaffinity(0)),
@@ -84,14 +89,14 @@ class GenerateSettings(Resumable):
     def file(self) -> Path:
         """The dataset to write, by default named as OGBench names it.
 
-        A humanoid's is named otherwise, as its episodes do not start as OGBench's do.
+        That of a humanoid that starts standing is named otherwise, as OGBench drops it.
 
         Raises:
-            ValueError: If a humanoid's is to have the name of one of OGBench's.
+            ValueError: If that is to have the name of one of OGBench's.
         """
         maze = describe_environment(self.environment).spec.name.removesuffix('-v0')
         name = f'{maze}-{self.kind}-v0'
-        if maze.startswith('humanoidmaze'):
+        if self.standing:
             if self.output and self.output.stem == name:
                 raise ValueError(
                     f"{self.output}: is the name of OGBench's data, whose humanoid is dropped "
@@ -132,6 +137,7 @@ def _run(settings: GenerateSettings) -> None:
         rows_per_episode=settings.rows_per_episode,
         noise=settings.noise,
         to_goal=settings.to_goal,
+        standing=settings.standing,
     )
     output = settings.file
     with tqdm(unit=' episodes', desc=output.stem, delay=0.5) as bar:

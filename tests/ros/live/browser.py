@@ -12,6 +12,7 @@ from selenium import webdriver
 from selenium.common.exceptions import WebDriverException
 from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
 from sim_bridge import MazeMap
 
 CHROMIUM, DRIVER = shutil.which('chromium'), shutil.which('chromedriver')
@@ -65,7 +66,25 @@ class Browser:
         self._click(f'//button[.//*[text()="{label}"]]')
 
     def click_checkbox(self, label: str) -> None:
-        self._click(f'//*[normalize-space()="{label}"]/following::input[1]')
+        self._input(label).click()
+
+    def type_number(self, label: str, text: str) -> None:
+        field = self._input(label)
+        field.send_keys(Keys.CONTROL, 'a')
+        field.send_keys(text)
+        field.send_keys(Keys.TAB)
+
+    def choose(self, label: str, option: str) -> None:
+        self._input(label).click()
+        self.wait(
+            lambda: self._click(f'//*[@role="option"][normalize-space()="{option}"]') or True,
+            f'the option {option}',
+        )
+
+    def _input(self, label: str) -> Any:
+        return self.driver.find_element(
+            By.XPATH, f'//*[normalize-space()="{label}"]/following::input[1]'
+        )
 
     def _click(self, xpath: str) -> None:
         self.driver.find_element(By.XPATH, xpath).click()

@@ -1,11 +1,13 @@
 """The live view as its users have it: processes, a browser and clicks."""
 
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 import signal
 import socket
 import subprocess
 import sys
+from typing import Any
 
 from metagcttt_interfaces.action import ReachGoal
 from metagcttt_interfaces.msg import EpisodeEvent
@@ -13,6 +15,7 @@ from metagcttt_tools.graph.process import NodeProcess
 from metagcttt_tools.recordings.mcap import read_messages
 import pytest
 from rcl_interfaces.srv import GetParameters
+from rclpy.parameter import parameter_value_to_python
 from sim_bridge import maze_map
 from tests.ros.graph import Graph, Record
 from tests.ros.live.browser import Browser, needs_chromium
@@ -33,17 +36,23 @@ def nodes(start_process: Callable[..., NodeProcess], graph: Graph) -> dict[str, 
     return nodes
 
 
-@pytest.fixture
-def view(ros_domain: int, tmp_path: Path) -> Iterator[subprocess.Popen]:
-    """`metagcttt view`; the fixture's `url` attribute is where it listens."""
-    command = [sys.executable, '-m', 'metagcttt_tools', 'view', '--out', str(tmp_path / 'out')]
+@contextmanager
+def viewing(*arguments: str) -> Iterator[subprocess.Popen]:
+    """`metagcttt view`; the attribute `url` is where it listens."""
+    command = [sys.executable, '-m', 'metagcttt_tools', 'view', *arguments]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         lines = iter(process.stdout.readline, '')
-        line = next(line for line in lines if line.startswith('live view: '))
+        line = next(line for line in lines if line.startswith(('live view', 'replay of')))
         process.url = line.split()[-1]
         yield process
         process.terminate()
         assert process.wait(30) == 0
+
+
+@pytest.fixture
+def view(ros_domain: int, tmp_path: Path) -> Iterator[subprocess.Popen]:
+    with viewing('--out', str(tmp_path / 'out')) as process:
+        yield process
 
 
 @pytest.fixture
@@ -89,17 +98,23 @@ def test_click_on_the_floor_makes_the_robot_reach_it(
 
 
 def test_controls_change_the_graph(graph: Graph, record: Record, view, tmp_path: Path) -> None:
-    def adapt_steps() -> int:
-        request = GetParameters.Request(names=['adapt_steps'])
+    def parameter(name: str) -> Any:
+        request = GetParameters.Request(names=[name])
         answer = graph.call(GetParameters, 'policy_node/get_parameters', request)
-        return answer.values[0].integer_value
+        return parameter_value_to_python(answer.values[0])
 
     with Browser(view.url, MAZE) as browser:
         browser.wait_for_text('stepping')
         browser.wait_for_text('policy_node')
-        assert adapt_steps() == 10
+        assert parameter('adapt_steps') == 10
         browser.click_checkbox('Test-time training')
-        graph.wait(lambda: adapt_steps() == 0, 'no adaptation')
+        graph.wait(lambda: parameter('adapt_steps') == 0, 'no adaptation')
+        browser.click_checkbox('Test-time training')
+        browser.type_number('K (gradient steps)', '25')
+        graph.wait(lambda: parameter('adapt_steps') == 25, 'the K that was typed')
+
+        browser.choose('Policy', 'base')
+        graph.wait(lambda: Path(parameter('checkpoint')).name == 'base', 'another policy')
 
         browser.click_checkbox('Record')
         browser.wait_for_text('recording to')
@@ -109,6 +124,9 @@ def test_controls_change_the_graph(graph: Graph, record: Record, view, tmp_path:
         browser.click_checkbox('Record')
         browser.wait(lambda: 'messages in' in path.with_suffix('.log').read_text(), 'its end')
     assert read_messages(path, STATES).complete
+    with viewing('--replay', str(path)) as replay, Browser(replay.url, MAZE) as browser:
+        browser.wait_for_text('Time (s)')
+        browser.wait_for_text('policy_node')
 
 
 def test_lost_browser_and_lost_nodes_harm_nothing(

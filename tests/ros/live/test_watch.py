@@ -7,6 +7,8 @@ from metagcttt.commander import NoAnswerError
 from metagcttt.goal.node import GoalNode
 from metagcttt_interfaces.action import ReachGoal
 from metagcttt_tools.live import watch as watch_module
+from metagcttt_tools.live import words
+from metagcttt_tools.live.robots import Robot
 from metagcttt_tools.live.watch import RefusedError, Watch
 import pytest
 from tests.ros.goal_rig import FREE, GoalRig
@@ -38,12 +40,12 @@ def test_settings_and_health_are_those_of_the_nodes(
     graph: Graph, dataset_file: Path, watch: Watch, policy: PolicyRig, monkeypatch
 ) -> None:
     graph.add(GoalNode, dataset=str(dataset_file), goal_tolerance_m=0.25)
-    graph.wait(lambda: watch.read_settings() or (watch.policy and watch.spec), 'the settings')
+    graph.wait(lambda: watch.read_settings() or (watch.policy and watch.robot), 'the settings')
     assert watch.policy['adapt_steps'] == 3
-    assert (watch.spec.name, watch.tolerance_m) == ('pointmaze-medium-v0', 0.25)
+    assert watch.robot == Robot('pointmaze-medium-v0', (0, 1), tolerance_m=0.25)
     graph.wait(lambda: len(watch.health()) == 2, 'the health of both')
     assert watch.health()[1] == ('policy_node', 0, 'no goal')
-    monkeypatch.setattr(watch_module, '_SILENT_S', 0.0)
+    monkeypatch.setattr(words, '_SILENT_S', 0.0)
     assert [(level, text) for _, level, text in watch.health()] == 2 * [(2, 'silent')]
 
 

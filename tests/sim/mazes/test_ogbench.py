@@ -184,8 +184,8 @@ def test_free_start_keeps_the_pose_of_a_walking_robot() -> None:
         np.testing.assert_array_equal(placed, np.concatenate([ant.qpos, ant.qvel]))
 
 
-def test_humanoid_starts_free_episodes_on_its_feet_and_tasks_as_in_ogbench() -> None:
-    with make_simulator('humanoidmaze-medium-v0') as humanoid:
+def test_humanoid_starts_free_episodes_as_its_tasks() -> None:
+    with make_simulator('humanoidmaze-medium-v0', standing=True) as humanoid:
         placed = humanoid.reset_free(seed=2, start_xy=(8.0, 8.0))
         assert placed[:2].tolist() == [8.0, 8.0]
         assert placed[23] == pytest.approx(1.49)  # height of the head
@@ -193,6 +193,10 @@ def test_humanoid_starts_free_episodes_on_its_feet_and_tasks_as_in_ogbench() -> 
         np.testing.assert_array_equal(placed, humanoid.reset_free(seed=2, start_xy=(8.0, 8.0)))
         yaws = [humanoid.reset_free(seed=seed, start_xy=(8.0, 8.0)) for seed in range(2)]
         assert not np.array_equal(*yaws)
+    with make_simulator('humanoidmaze-medium-v0') as humanoid:
+        dropped = humanoid.reset_free(seed=2, start_xy=(8.0, 8.0))
+        assert dropped[:2].tolist() == [8.0, 8.0]
+        assert dropped[36:39].tolist() != pytest.approx([0, 0, 1], abs=0.01)
         for _ in range(60):
             humanoid.step(np.zeros(21))
         assert has_fallen(humanoid.qpos)

@@ -53,6 +53,7 @@ GENERATE = Walk(
         'rows_per_episode': 9,
         'noise': 0.1,
         'to_goal': True,
+        'standing': Proof(True, refused='only humanoids have a standing start'),
         'seed': 1,
         'output': 'elsewhere.npz',
         'processes': 2,
@@ -217,6 +218,7 @@ INSPECT = Walk(
     {
         'data': '@half.npz',
         'contract': Proof('@cart.yaml', refused='the contract of cart has 4 and 2'),
+        'columns': Proof('@action.yaml', {'data': PUSHT}),
         'coverage': [1, 0],
         'out': 'elsewhere.png',
     },
@@ -398,10 +400,15 @@ def watch_measuring(patch: pytest.MonkeyPatch, seen: Seen) -> None:
 
     def walk_to_goal(follower, maze, *given):
         seen.append(('goal', maze.spec.name, given))
-        return GoalRun(reached=True, fallen=False, duration_s=1.0)
+        return GoalRun(reached=True, falls=0, duration_s=1.0)
+
+    def stands_up(follower, maze, *given):
+        seen.append(('rise', maze.spec.name, given))
+        return True
 
     patch.setattr(controller_measure, 'walk_along', walk_along)
     patch.setattr(controller_measure, 'walk_to_goal', walk_to_goal)
+    patch.setattr(controller_measure, 'stands_up', stands_up)
     patch.setattr(controller_measure, 'OGBenchMaze', ShortSimulator)
     patch.setattr(controller_measure, 'film', lambda _, *given: seen.append(given))
     patch.setattr(plots, 'controller_picture', lambda walks: None)
@@ -417,6 +424,7 @@ MEASURE = Walk(
         'duration_s': 1.0,
         'repeats': 2,
         'walks': 3,
+        'drops': Proof(2, given={'controller': str(BUNDLED / 'humanoid')}),
         'mazes': ['large'],
         'episodes_per_task': 2,
         'action_noise': 0.4,

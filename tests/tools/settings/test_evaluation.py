@@ -2,9 +2,10 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import ModuleType
 
-from metagcttt_core.evaluation import rollout
-from metagcttt_tools import draw_episodes, evaluate, loss_curves, report, sweep
+from metagcttt_core.evaluation import offline, rollout
+from metagcttt_tools import draw_episodes, evaluate, evaluate_offline, loss_curves, report, sweep
 from metagcttt_tools.common import plots
 import pytest
 from tests.tools.settings.walk import (
@@ -25,16 +26,16 @@ WIDE = {'filter.epsilon': 4.0, 'filter.top_percent': 50.0}
 QUICK = {**WIDE, 'ttt.batch_size': 8, 'dataset': '@walks.npz'}
 
 
-def note_adaptations(patch: pytest.MonkeyPatch, seen: Seen) -> None:
-    """The supports, the experts and the actor loss of each adaptation in an episode."""
-    adapt = rollout.adapt
+def note_adaptations(patch: pytest.MonkeyPatch, seen: Seen, module: ModuleType = rollout) -> None:
+    """The supports, the experts and the actor loss of each adaptation."""
+    adapt = module.adapt
 
     def noting(agent, dataset, support, *others, **named):
         adaptation = adapt(agent, dataset, support, *others, **named)
         seen.append((support.indices, adaptation.agent))
         return adaptation
 
-    patch.setattr(rollout, 'adapt', noting)
+    patch.setattr(module, 'adapt', noting)
 
 
 def watch_evaluation(patch: pytest.MonkeyPatch, seen: Seen) -> None:
@@ -76,6 +77,42 @@ EVALUATE = Walk(
     },
     watch_evaluation,
 )
+OFFLINE = Walk(
+    'evaluate-offline',
+    {
+        **QUICK,
+        'checkpoints': ['@gcbc'],
+        'budgets': [2],
+        'processes': 1,
+        'trajectories': 3,
+        'steps_ahead': [9],
+        'held_out_share': 0.2,
+    },
+    {
+        'checkpoints': ['@other'],
+        'dataset': '@half.npz',
+        'held_out': '@half.npz',
+        'held_out_share': 0.5,
+        'trajectories': 4,
+        'queries': 2,
+        'steps_ahead': [8],
+        'budgets': [1],
+        'grid': True,
+        'epsilons': Proof([3.0], {'grid': True}),
+        'lrs': Proof([0.1], {'grid': True}),
+        'against': Proof(['nowhere.json'], refused='nowhere.json: no results'),
+        'seed': 1,
+        'processes': 3,
+        'out': 'elsewhere.json',
+        **under(
+            'ttt',
+            {**TTT, 'horizon': Proof(2, refused='horizon is of episodes')},
+            actor_only=CRITIC,
+        ),
+        **under('filter', FILTER, min_steps=CRITIC),
+    },
+    lambda patch, seen: watch_offline(patch, seen),
+)
 CRITIC_RUN = {'runs': ['@run-critic']}
 SUCCESS_CURVE = Walk(
     'success-curve',
@@ -89,6 +126,17 @@ SUCCESS_CURVE = Walk(
     },
     watch_evaluation,
 )
+
+
+def watch_offline(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    each = evaluate_offline._each
+    patch.setattr(
+        evaluate_offline,
+        '_each',
+        lambda jobs, processes, start: seen.append(processes) or each(jobs, 1, start),
+    )
+    patch.setattr(plots, 'save', lambda figure, path: seen.append(path))
+    note_adaptations(patch, seen, offline)
 
 
 def watch_drawing(patch: pytest.MonkeyPatch, seen: Seen) -> None:
@@ -189,7 +237,7 @@ REPORT = Walk(
     watch_report,
 )
 
-WALKS = (EVALUATE, SUCCESS_CURVE, DRAW, LOSSES, STUDY, REPORT)
+WALKS = (EVALUATE, OFFLINE, SUCCESS_CURVE, DRAW, LOSSES, STUDY, REPORT)
 
 
 @walks_through(WALKS)

@@ -10,6 +10,7 @@ from metagcttt_tools import demo
 from metagcttt_tools.benchmarks import restarts, ros, state_source
 from metagcttt_tools.graph import drive
 from metagcttt_tools.graph import process as nodes
+from metagcttt_tools.live import replay
 from metagcttt_tools.live import view as live
 import numpy as np
 import pytest
@@ -87,12 +88,19 @@ DEMO = Walk(
 
 def watch_view(patch: pytest.MonkeyPatch, seen: Seen) -> None:
     patch.setattr(live, 'show', lambda **settings: seen.append(settings))
+    patch.setattr(live, 'show_replay', lambda *given, **settings: seen.append((given, settings)))
+    patch.setattr(replay, 'Replay', lambda *files: files)
 
 
 VIEW = Walk(
     'view',
     {},
-    {'host': '0.0.0.0', 'port': 9000, 'robot': '/robot1', 'out': 'elsewhere'},
+    {
+        **{'host': '0.0.0.0', 'port': 9000, 'robot': '/robot1', 'out': 'elsewhere'},
+        'replay': 'run.mcap',
+        'checkpoint': Proof('policy', given={'replay': 'run.mcap'}),
+        'dataset': Proof('data.npz', given={'replay': 'run.mcap'}),
+    },
     watch_view,
 )
 

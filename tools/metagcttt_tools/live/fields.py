@@ -102,7 +102,9 @@ def _same(losses: Sequence[float], reported: Sequence[float]) -> bool:
 
 
 def grid_of(maze: MazeMap) -> np.ndarray:
-    """(n, 2) positions in metres, spread over the free cells."""
+    """(n, 2) positions in metres, spread over the free cells; none on a finer map."""
+    if maze.unit_m < 1:
+        return np.empty((0, 2))
     spread = (np.arange(_PER_CELL) + 0.5) / _PER_CELL - 0.5
     offsets = np.stack(np.meshgrid(spread, spread), -1).reshape(-1, 2) * maze.unit_m
     rows, cols = np.nonzero(~maze.walls)

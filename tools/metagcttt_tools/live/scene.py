@@ -1,11 +1,18 @@
 """The maze in three dimensions: walls, data, robot, goal, retrieved data and action fields."""
 
-from collections.abc import Sequence
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import cast, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from sim_bridge import MazeMap
+import trimesh
 import viser
+
+if TYPE_CHECKING:
+    from metagcttt_tools.live.body import Body, Pose
 
 Color = tuple[int, int, int]
 Point = tuple[float, float, float]
@@ -33,8 +40,9 @@ class MazeScene:
             maze: The maze.
         """
         self._server, self._scene = server, server.scene
-        self._unit = maze.unit_m
+        self._unit = scale_m(maze)
         self._scene.reset()
+        self._links: list[viser.MeshHandle] = []
         xmin, xmax, ymin, ymax = maze.extent
         center = ((xmin + xmax) / 2, (ymin + ymax) / 2)
         thick = 0.1
@@ -45,17 +53,21 @@ class MazeScene:
                 dimensions=(xmax - xmin, ymax - ymin, thick),
                 position=(*center, -thick / 2),
             )
-            height = maze.unit_m / 3
-            for row, col in np.argwhere(maze.walls):
-                x, y = maze.center(row, col)
-                self._scene.add_box(
-                    f'/walls/{row}-{col}',
+            if boxes := list(_wall_boxes(maze, self._unit / 3)):
+                walls = one_mesh(boxes)
+                self._scene.add_mesh_simple(
+                    '/walls',
+                    walls.vertices,
+                    walls.faces,
                     color=WALL,
-                    dimensions=(maze.unit_m, maze.unit_m, height),
-                    position=(x, y, height / 2),
+                    flat_shading=True,
+                    receive_shadow=False,
                 )
             self._robot = self._scene.add_icosphere(
-                '/robot', radius=0.18 * maze.unit_m, color=ROBOT, visible=False
+                '/robot', radius=0.18 * self._unit, color=ROBOT, visible=False
+            )
+            self._nose = self._scene.add_arrows(
+                '/nose', np.zeros((1, 2, 3)), ROBOT, shaft_radius=0.05 * self._unit, visible=False
             )
             self._goal = self._scene.add_cylinder(
                 '/goal', radius=1.0, height=thick, color=GOAL, visible=False
@@ -63,10 +75,29 @@ class MazeScene:
         camera = server.initial_camera
         camera.position, camera.look_at = (np.array(point) for point in viewpoint(maze))
 
-    def move_robot(self, xy: tuple[float, float]) -> None:
-        """Put the robot at a position."""
+    def move_robot(self, xy: tuple[float, float], heading: tuple[float, float] | None) -> None:
+        """Put the robot at a position; one without links also looks along a unit vector."""
         self._robot.position = (*xy, self._robot.radius)
-        self._robot.visible = True
+        self._robot.visible = not self._links
+        self._nose.visible = heading is not None
+        if heading is not None:
+            nose = np.array([np.zeros(2), 0.45 * self._unit * np.array(heading)]) + np.array(xy)
+            self._nose.points = _raised(nose[None], self._robot.radius)
+
+    def add_body(self, body: Body) -> None:
+        """Give the robot its links, to be posed."""
+        self._links = [
+            self._scene.add_mesh_simple(
+                f'/links/{number}', mesh.vertices, mesh.faces, color=ROBOT, visible=False
+            )
+            for number, mesh in enumerate(body.meshes)
+        ]
+
+    def pose(self, poses: Sequence[Pose]) -> None:
+        """Put each link at its pose."""
+        for link, (position, quaternion) in zip(self._links, poses, strict=True):
+            link.position, link.wxyz = position, quaternion
+            link.visible = True
 
     def show_goal(self, xy: tuple[float, float] | None, radius_m: float) -> None:
         """Show the goal with its tolerance, or none."""
@@ -124,6 +155,27 @@ class MazeScene:
     def remove(self, name: str) -> None:
         """Take something out of the scene, if it is there."""
         self._scene.remove_by_name(f'/{name}')
+
+
+def scale_m(maze: MazeMap) -> float:
+    """The size of what is drawn: a cell of a maze, a part of the width of a finer map."""
+    xmin, xmax, ymin, ymax = maze.extent
+    return maze.unit_m if maze.unit_m >= 1 else max(xmax - xmin, ymax - ymin) / 10
+
+
+def one_mesh(parts: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """Several shapes as one."""
+    return cast('trimesh.Trimesh', trimesh.util.concatenate(parts))
+
+
+def _wall_boxes(maze: MazeMap, height_m: float) -> Iterator[trimesh.Trimesh]:
+    """A box for every stretch of wall along a row."""
+    for row, cells in enumerate(maze.walls):
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], cells, [False]])))
+        for begin, end in edges.reshape(-1, 2):
+            (x0, y), (x1, _) = maze.center(row, begin), maze.center(row, end - 1)
+            box = trimesh.creation.box((x1 - x0 + maze.unit_m, maze.unit_m, height_m))
+            yield box.apply_translation(((x0 + x1) / 2, y, height_m / 2))
 
 
 def viewpoint(maze: MazeMap) -> tuple[Point, Point]:

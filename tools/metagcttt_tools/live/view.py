@@ -9,19 +9,22 @@ from pathlib import Path
 import queue
 import socket
 import time
+from typing import Any
 
 from metagcttt.commander import NoAnswerError
 from metagcttt.signals import ignore_signals, stop_on_signals
 from metagcttt_core.config.assets import checkpoint_path
-from metagcttt_interfaces.msg import AdaptationReport, PolicyStatus
+from metagcttt_core.robot import ContractError
+from metagcttt_interfaces.msg import PolicyStatus
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 import torch
 import viser
 
 from metagcttt_tools.graph.process import NodeFailedError, NodeProcess
-from metagcttt_tools.live.panel import Controls, Panel
+from metagcttt_tools.live.panel import Controls, GraphControls, Panel, Player
 from metagcttt_tools.live.picture import Picture
+from metagcttt_tools.live.replay import Replay
 from metagcttt_tools.live.scene import floor_point
 from metagcttt_tools.live.watch import RefusedError, Watch
 
@@ -42,8 +45,63 @@ class _Server(viser.ViserServer):
         """Refuse."""
 
 
+class Window:
+    """A page in the browsers that shows what is known of a robot; they may come and go."""
+
+    def __init__(self, *, host: str, port: int, hint: str) -> None:
+        """Start the server.
+
+        Args:
+            host: Address to listen on.
+            port: Port to listen on; the next free one when it is taken.
+            hint: What to do first.
+
+        Raises:
+            OSError: If there is no such address.
+        """
+        self._pool = ThreadPoolExecutor(1)
+        with socket.create_server((host, 0)):
+            pass  # viser would wait forever at an address that this machine does not have
+        self.server = _Server(host, port, label='Meta-GC-TTT', verbose=False)
+        self.url = f'http://{host}:{self.server.get_port()}'
+        self.server.gui.configure_theme(
+            control_layout='fixed', show_logo=False, show_share_button=False
+        )
+        self.panel = Panel(self.server.gui, hint)
+        self._picture: Picture | None = None
+        self._losses_of: Any = None
+
+    def close(self) -> None:
+        """Stop the server."""
+        if self._picture is not None:
+            self._picture.close()
+        self._pool.shutdown()
+        self.server.stop()
+
+    def refresh(self, seen: Watch | Replay) -> None:
+        """Show what is known now."""
+        actor = 'adapted policy' if seen.status.adapted else 'base policy'
+        phase = _PHASES[seen.status.phase].format(s=seen.status, policy=actor)
+        self.panel.show_state(f'**{phase}**\n\n{seen.news}')
+        self.panel.show_health(seen.health())
+        if seen.report is not None and seen.report is not self._losses_of:
+            self._losses_of = seen.report
+            self.panel.show_losses(seen.report.train_losses)
+        if seen.grid is None and seen.state is None:
+            return
+        if self._picture is None or self._picture.grid is not seen.grid:
+            if self._picture is not None:
+                self._picture.close()
+            self._picture = Picture(self.server, seen, self._pool)
+        with self.server.atomic():
+            self._picture.refresh()
+        if self._picture.fault:
+            self.panel.say(f'⚠️ {self._picture.fault}')
+            self._picture.fault = ''
+
+
 class LiveView:
-    """Shows one robot in a browser until it is stopped; browsers and nodes may come and go."""
+    """Shows one robot of a running graph until it is stopped; nodes may come and go."""
 
     def __init__(
         self,
@@ -68,18 +126,12 @@ class LiveView:
         """
         self._robot_name, self._out, self._check = robot, out, check
         self._jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._pool = ThreadPoolExecutor(1)
-        with socket.create_server((host, 0)):
-            pass  # viser would wait forever at an address that this machine does not have
+        self._window = Window(host=host, port=port, hint='Click on the floor to send a goal.')
+        self._panel, self.url = self._window.panel, self._window.url
         self._watch = Watch(namespace=robot, while_waiting=self._while_waiting)
-        self._server = _Server(host, port, label='Meta-GC-TTT', verbose=False)
-        self.url = f'http://{host}:{self._server.get_port()}'
-        self._server.gui.configure_theme(
-            control_layout='fixed', show_logo=False, show_share_button=False
-        )
         ask = self._jobs.put
-        self._panel = Panel(
-            self._server.gui,
+        self._controls = GraphControls(
+            self._window.server.gui,
             Controls(
                 cancel=lambda: ask(self._watch.cancel_goals),
                 set_steps=lambda steps: ask(partial(self._watch.set_policy, adapt_steps=steps)),
@@ -87,15 +139,13 @@ class LiveView:
                 record=lambda on: ask(partial(self._record, on)),
             ),
         )
-        self._server.scene.on_click()(
+        self._window.server.scene.on_click()(
             lambda event: ask(
                 partial(self._send, floor_point(event.ray_origin, event.ray_direction))
             )
         )
         self._next_refresh_s = self._next_settings_s = 0.0
         self._recorder: NodeProcess | None = None
-        self._picture: Picture | None = None
-        self._losses_of: AdaptationReport | None = None
 
     def run(self) -> None:
         """Show the graph until an exception ends it, such as that of a signal."""
@@ -113,10 +163,7 @@ class LiveView:
         """Leave the graph, end a recording and stop the server."""
         if self._recorder is not None:
             self._recorder.stop()
-        if self._picture is not None:
-            self._picture.close()
-        self._pool.shutdown()
-        self._server.stop()
+        self._window.close()
         self._watch.destroy_node()
 
     # --- from the browser --------------------------------------------------------------------
@@ -125,7 +172,7 @@ class LiveView:
         """Do what was asked; that a node refuses it or is gone is shown and ends nothing."""
         try:
             job()
-        except (NoAnswerError, RefusedError, NodeFailedError) as error:
+        except (NoAnswerError, RefusedError, NodeFailedError, ContractError) as error:
             self._panel.say(f'⚠️ {error}')
 
     def _send(self, xy: tuple[float, float] | None) -> None:
@@ -160,28 +207,11 @@ class LiveView:
             self._next_refresh_s = time.monotonic() + _REFRESH_S
 
     def _refresh(self) -> None:
-        watch, panel = self._watch, self._panel
-        policy = watch.policy
-        if policy:
-            panel.show_settings(policy['adapt_steps'], checkpoint_path(policy['checkpoint']))
-        actor = 'adapted policy' if watch.status.adapted else 'base policy'
-        phase = _PHASES[watch.status.phase].format(s=watch.status, policy=actor)
-        panel.show_state(f'**{phase}**\n\n{watch.news}')
-        panel.show_health(watch.health())
-        panel.show_recording(self._recorder is not None)
-        if watch.report is not None and watch.report is not self._losses_of:
-            self._losses_of = watch.report
-            panel.show_losses(watch.report.train_losses)
-        if watch.grid is not None:
-            if self._picture is None or self._picture.grid is not watch.grid:
-                if self._picture is not None:
-                    self._picture.close()
-                self._picture = Picture(self._server, watch, self._pool)
-            with self._server.atomic():
-                self._picture.refresh()
-            if self._picture.fault:
-                panel.say(f'⚠️ {self._picture.fault}')
-                self._picture.fault = ''
+        if policy := self._watch.policy:
+            checkpoint = checkpoint_path(policy['checkpoint'])
+            self._controls.show_settings(policy['adapt_steps'], checkpoint)
+        self._controls.show_recording(self._recorder is not None)
+        self._window.refresh(self._watch)
 
 
 def show(
@@ -205,3 +235,28 @@ def show(
         ignore_signals()
         view.close()
         rclpy.try_shutdown()
+
+
+def show_replay(replay: Replay, *, host: str = '127.0.0.1', port: int = 8080) -> None:
+    """Show a recording until Ctrl-C or SIGTERM, which end the process."""
+    stop_on_signals()
+    torch.set_num_threads(1)
+    sought: queue.SimpleQueue[float] = queue.SimpleQueue()
+    window = Window(host=host, port=port, hint='A recording; drag the time to look around.')
+    player = Player(window.server.gui, replay.duration_s, sought.put)
+    try:
+        print(f'replay of {replay.duration_s:.1f} s: {window.url}', flush=True)
+        before_s = time.monotonic()
+        while True:
+            now_s = time.monotonic()
+            if player.playing:
+                replay.seek(replay.time_s + (now_s - before_s) * player.speed)
+            before_s = now_s
+            while not sought.empty():
+                replay.seek(sought.get())
+            player.show(replay.time_s)
+            window.refresh(replay)
+            time.sleep(_REFRESH_S)
+    finally:
+        ignore_signals()
+        window.close()

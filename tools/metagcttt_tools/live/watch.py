@@ -1,6 +1,7 @@
 """A running graph as the live view knows it: newest messages, and requests to its nodes."""
 
 from functools import partial
+from pathlib import Path
 import time
 from typing import Any
 
@@ -20,8 +21,9 @@ from metagcttt_interfaces.msg import (
 from nav_msgs.msg import OccupancyGrid
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter, parameter_value_to_python
-from sim_bridge import describe_environment
-from sim_bridge.simulator import SimulatorSpec
+
+from metagcttt_tools.live.robots import contracted, Robot, simulated
+from metagcttt_tools.live.words import health_of, news_of, WAITING
 
 _POLICY_SETTINGS = (
     *('checkpoint', 'dataset', 'adapt_steps', 'adapt_lr', 'adapt_batch_size'),
@@ -29,16 +31,6 @@ _POLICY_SETTINGS = (
 )
 _ANSWER_S = 5.0
 _CONFIGURED_S = 60.0  # policy and dataset are loaded
-_SILENT_S = 3.0
-
-_EVENTS = {
-    EpisodeEvent.STARTED: 'episode {e.episode_id} began',
-    EpisodeEvent.GOAL_ACCEPTED: 'goal {e.query_id} accepted',
-    EpisodeEvent.GOAL_REJECTED: 'goal rejected: {e.reason}',
-    EpisodeEvent.REACHED: 'goal {e.query_id} reached',
-    EpisodeEvent.TIMED_OUT: 'goal {e.query_id} not reached in time',
-    EpisodeEvent.ENDED: 'goal {e.query_id} ended: {e.reason}',
-}
 
 
 class RefusedError(RuntimeError):
@@ -56,8 +48,8 @@ class Watch(RobotCommander):
         status: What the policy is doing.
         news: The newest event, in words.
         policy: Parameters of the policy node; empty until it answers.
-        spec: The environment of the goal node; None until it answers.
-        tolerance_m: Distance within which a goal is reached, metres.
+        robot: By the environment of the goal node or the contract of the robot bridge; None until
+            one of them answers.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -72,10 +64,9 @@ class Watch(RobotCommander):
         self.goal: GoalQuery | None = None
         self.report: AdaptationReport | None = None
         self.status = PolicyStatus()
-        self.news = 'waiting for the graph'
+        self.news = WAITING
         self.policy: dict[str, Any] = {}
-        self.spec: SimulatorSpec | None = None
-        self.tolerance_m = 1.0
+        self.robot: Robot | None = None
         self._health: dict[str, tuple[DiagnosticStatus, float]] = {}
         for message_type, topic, attribute, profile in (
             (MazeState, 'state', 'state', SENSOR),
@@ -94,13 +85,14 @@ class Watch(RobotCommander):
         self._set_policy = self.create_client(SetParameters, 'policy_node/set_parameters')
         self._of_policy = self.create_client(GetParameters, 'policy_node/get_parameters')
         self._of_goal_node = self.create_client(GetParameters, 'goal_node/get_parameters')
+        self._of_bridge = self.create_client(GetParameters, 'robot_bridge_node/get_parameters')
 
     def _on_map(self, message: OccupancyGrid) -> None:
         self.grid = message
         self._frame_id = message.header.frame_id
 
     def _on_news(self, message: EpisodeEvent) -> None:
-        self.news = _EVENTS[message.kind].format(e=message)
+        self.news = news_of(message)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -109,13 +101,7 @@ class Watch(RobotCommander):
 
     def health(self) -> list[tuple[str, int, str]]:
         """Name, level and message of every node that was heard of; a silent one is in error."""
-        now_s = time.monotonic()
-        return [
-            (name.rpartition('/')[2], 2, 'silent')
-            if now_s - heard_s > _SILENT_S
-            else (name.rpartition('/')[2], status.level[0], status.message)
-            for name, (status, heard_s) in sorted(self._health.items())
-        ]
+        return health_of(self._health, time.monotonic())
 
     def spin(self, timeout_s: float) -> None:
         """Handle a message, waiting for it at most so long."""
@@ -128,6 +114,7 @@ class Watch(RobotCommander):
 
         Raises:
             NoAnswerError: If one of them does not answer.
+            ContractError: If the contract of the robot is not readable here.
         """
         if self._of_policy.service_is_ready():
             request = GetParameters.Request(names=_POLICY_SETTINGS)
@@ -137,8 +124,11 @@ class Watch(RobotCommander):
         if self._of_goal_node.service_is_ready():
             request = GetParameters.Request(names=['environment', 'goal_tolerance_m'])
             name, tolerance = self._call(self._of_goal_node, request, _ANSWER_S).values
-            self.spec = describe_environment(name.string_value).spec
-            self.tolerance_m = tolerance.double_value or self.spec.goal_tolerance_m
+            self.robot = simulated(name.string_value, tolerance.double_value)
+        if self._of_bridge.service_is_ready():
+            request = GetParameters.Request(names=['contract'])
+            (contract,) = self._call(self._of_bridge, request, _ANSWER_S).values
+            self.robot = contracted(Path(contract.string_value).expanduser())
 
     def cancel_goals(self) -> None:
         """Cancel the action goal under way, whoever sent it.

@@ -15,11 +15,11 @@ from metagcttt_core import (
     TTTConfig,
 )
 from metagcttt_core.adaptation import AdaptationCancelled, OnStep
-from metagcttt_core.adaptation.config import EngineName
 from metagcttt_core.adaptation.inner_loop import run_inner_loop
 from metagcttt_core.config.assets import checkpoint_path, dataset_path
 from metagcttt_core.retrieval.value_cache import ValueFunction
 from metagcttt_core.robot import identity_fault
+from metagcttt_core.training.config import EngineName
 from metagcttt_core.training.optimizers import pretrained_state
 import numpy as np
 from numpy.typing import NDArray
