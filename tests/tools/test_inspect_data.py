@@ -64,6 +64,10 @@ def test_bags_are_inspected_by_their_contract(files, tmp_path, capsys):
     text = capsys.readouterr().out
     assert ['odom', '30', '10.0', '0'] in [line.split() for line in text.splitlines()]
     assert '1 trajectories of 29 to 29 transitions' in text
+    out = str(tmp_path / 'imported.npz')
+    main(['import-bags', '--contract', files[1], '--bags', str(bag), '--out', out])
+    inspected(tmp_path, Path(out), '--contract', files[1])
+    assert '10 Hz by the contract; a gap ends a trajectory' in capsys.readouterr().out
     with pytest.raises(SystemExit, match='2'):
         inspected(tmp_path, bag)
     assert 'a bag takes a contract: give --contract' in capsys.readouterr().err

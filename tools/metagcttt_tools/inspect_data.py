@@ -51,12 +51,13 @@ class InspectSettings(Settings):
 
 
 class Opened(NamedTuple):
-    """Data of whatever form, the names of their values, and what there is to say of the form."""
+    """Data of whatever form, names of their values, remarks on the form, and a contract's rate."""
 
     dataset: TrajectoryDataset
     observed: Sequence[str]
     commanded: Sequence[str]
     remarks: list[str]
+    rate_hz: float | None = None
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -76,7 +77,7 @@ def main(argv: list[str] | None = None) -> None:
     if not (0 <= x < width and 0 <= y < width):
         fail(f'coverage must be two of the observed values 0 to {width - 1}')
     print(*opened.remarks, opened.dataset, sep='\n')
-    print(describe(found, opened.observed, opened.commanded))
+    print(describe(found, opened.observed, opened.commanded, opened.rate_hz))
     places = opened.dataset.states(slice(None))[:, [x, y]]
     plots.save(plots.places_picture(places, opened.observed[x], opened.observed[y]), settings.out)
     print(f'coverage: {settings.out}')
@@ -96,7 +97,8 @@ def open_data(settings: InspectSettings) -> Opened:
     if path.suffix in _TABLES or (path / 'meta' / 'info.json').is_file():
         return _open_table(path, contract, settings.columns)
     dataset = TrajectoryDataset.load(path)
-    return Opened(dataset, *names_of(dataset, contract), [])
+    rate_hz = contract.rate_hz if contract else (dataset.contract or {}).get('rate_hz')
+    return Opened(dataset, *names_of(dataset, contract), [], rate_hz)
 
 
 def _open_bag(path: Path, contract: Contract | None) -> Opened:
@@ -111,7 +113,9 @@ def _open_bag(path: Path, contract: Contract | None) -> Opened:
             raise DatasetError('\n'.join(faults))
         episodes = read_episodes(contract, bag.messages())
         dataset = episodes.dataset()
-    return Opened(dataset, *names_of(dataset, contract), [describe_bag(episodes), ''])
+    return Opened(
+        dataset, *names_of(dataset, contract), [describe_bag(episodes), ''], contract.rate_hz
+    )
 
 
 def _open_table(path: Path, contract: Contract | None, columns: Path | None) -> Opened:
@@ -133,8 +137,13 @@ def _open_table(path: Path, contract: Contract | None, columns: Path | None) -> 
     return Opened(found.dataset, found.observed, found.commanded, found.in_words())
 
 
-def describe(found: Inspection, observed: Sequence[str], commanded: Sequence[str]) -> str:
-    """What is in a dataset, as text."""
+def describe(
+    found: Inspection,
+    observed: Sequence[str],
+    commanded: Sequence[str],
+    rate_hz: float | None = None,
+) -> str:
+    """What is in a dataset, as text; `rate_hz` is that of its contract."""
     shortest, middle, longest = np.percentile(found.lengths, (0, 50, 100))
     columns = list(
         zip((*observed, *commanded), (*found.observations, *found.actions), strict=True)
@@ -142,7 +151,7 @@ def describe(found: Inspection, observed: Sequence[str], commanded: Sequence[str
     lines = [
         f'{len(found.lengths)} trajectories of {shortest:g} to {longest:g} transitions '
         f'(median {middle:g})',
-        _pace_in_words(found.pace),
+        _pace_in_words(found.pace, rate_hz),
         '',
         tabulate([_row(name, column) for name, column in columns], _HEADERS, floatfmt='.4g'),
         '',
@@ -164,7 +173,9 @@ def describe(found: Inspection, observed: Sequence[str], commanded: Sequence[str
     return '\n'.join(lines)
 
 
-def _pace_in_words(pace: Pace | None) -> str:
+def _pace_in_words(pace: Pace | None, rate_hz: float | None) -> str:
+    if pace is None and rate_hz is not None:
+        return f'{rate_hz:g} Hz by the contract; a gap ends a trajectory'
     if pace is None:
         return 'rates and gaps are not known: there are no times in the data'
     low, _, high = pace.steps_s

@@ -7,12 +7,14 @@ import time
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist
+from metagcttt.converters import to_time
 from metagcttt.robot.node import RobotBridgeNode
 from metagcttt_core.robot import ContractError
 from metagcttt_interfaces.msg import ActionCommand, MazeState
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray
 from std_srvs.srv import SetBool
@@ -32,11 +34,18 @@ def odometry(stamp_ns: int, x: float = 0.0, frame_id: str = 'odom') -> Odometry:
 class Rig:
     """A bridge to a cart, and what it sends."""
 
-    def __init__(self, graph: Graph, folder: Path, text: str = DRIVE) -> None:
+    def __init__(
+        self, graph: Graph, folder: Path, text: str = DRIVE, *, use_sim_time: bool = False
+    ) -> None:
         self.graph = graph
         file = folder / 'robot.yaml'
         file.write_text(text)
-        self.node = graph.add(RobotBridgeNode, contract=str(file), diagnostics_period_s=0.05)
+        self.node = graph.add(
+            RobotBridgeNode,
+            contract=str(file),
+            diagnostics_period_s=0.05,
+            use_sim_time=use_sim_time,
+        )
         self.states: list[MazeState] = graph.collect(MazeState, 'state', ANY)
         self.commands: list[Twist] = graph.collect(Twist, 'cmd_vel', RELIABLE)
         self.diagnostics = graph.collect(DiagnosticArray, '/diagnostics', RELIABLE)
@@ -331,3 +340,41 @@ def test_process_says_farewell_with_zeros(graph: Graph, tmp_path: Path, start_pr
     assert process.stop(signal_number=signal.SIGTERM) == 0
     graph.wait(lambda: commands, 'the farewell')
     assert [(c.linear.x, c.angular.z) for c in commands] == [(0.0, 0.0)]
+
+
+def test_simulation_that_starts_again_is_another_world_observed_at_once(
+    graph: Graph, tmp_path: Path
+) -> None:
+    """What was observed before never is a state, nor its goal in force, after the jump."""
+    rig = Rig(graph, tmp_path, use_sim_time=True)
+    clock = graph.node.create_publisher(Clock, '/clock', RELIABLE)
+    graph.wait(clock.get_subscription_count, 'who follows the clock')
+
+    def play(begin_s: float, x: float, condition: Callable[[], bool], what: str) -> None:
+        now_ns, end = round(begin_s * 1e9), time.monotonic() + 30.0
+        while not condition():
+            assert time.monotonic() < end, f'waited in vain for {what}: {rig.health()}'
+            now_ns += 20 * 10**6
+            clock.publish(Clock(clock=to_time(now_ns)))
+            rig._odometry.publish(odometry(now_ns, x=x))
+            graph.wait_for(0.02)
+
+    play(100.0, 1.0, lambda: len(rig.states) > 3, 'states')
+    rig.answer()
+    play(103.0, 1.0, lambda: any(c.angular.z for c in rig.commands), 'a motion')
+    first = rig.states[-1].world_id
+    rig.states.clear()
+    play(10.0, 5.0, lambda: len(rig.states) > 3, 'states of the new world')
+    new = [state for state in rig.states if state.world_id != first]
+    assert len(new) >= 3
+    assert {state.observation[0] for state in new} == {5.0}
+    assert all(state.header.stamp.sec >= 100 for state in rig.states if state not in new)
+    rig.commands.clear()
+    rig.answer(world_id=first)
+    play(12.0, 5.0, lambda: len(rig.states) > 9, 'more states')
+    assert not any(command.angular.z for command in rig.commands)
+    clock.publish(Clock(clock=to_time(12 * 10**9)))  # stands still from here on
+    graph.wait_for(0.5)
+    standing = len(rig.states)
+    graph.wait_for(0.5)
+    assert len(rig.states) == standing

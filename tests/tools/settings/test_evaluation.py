@@ -2,7 +2,8 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from types import ModuleType
+import sys
+from types import ModuleType, SimpleNamespace
 
 from metagcttt_core.evaluation import offline, rollout
 from metagcttt_tools import draw_episodes, evaluate, evaluate_offline, loss_curves, report, sweep
@@ -11,6 +12,7 @@ import pytest
 from tests.tools.settings.walk import (
     FILTER,
     INNER_LOOP,
+    note_time_limits,
     Proof,
     Seen,
     ShortSimulator,
@@ -192,11 +194,19 @@ LOSSES = Walk(
 
 def watch_study(patch: pytest.MonkeyPatch, seen: Seen) -> None:
     patch.setattr(sweep, 'format_estimate', lambda *runs: seen.append(runs))
-    patch.setattr(
-        sweep,
-        '_run_all',
-        lambda tool, runs, processes, stop: seen.append((tool, list(runs), processes)),
+
+    def ran(tool, jobs, scheduler, stop):
+        shown = [(job.invocation.preset.read_text(), job.size, job.cpus) for job in jobs]
+        seen.append((tool, shown, scheduler))
+
+    patch.setattr(sweep, 'run_all', ran)
+    patch.setattr(sweep, 'LocalScheduler', lambda *given: ('local', given))
+    patch.setitem(
+        sys.modules,
+        'metagcttt_tools.jobs.cluster',
+        SimpleNamespace(RayScheduler=lambda resources: ('cluster', resources)),
     )
+    note_time_limits(patch, seen, sweep)
 
 
 ARMS = {'slow': {'meta': {'inner_lr': 1e-6}}}
@@ -212,6 +222,11 @@ STUDY = Walk(
         'curve': [0.5],
         'curve_budgets': Proof([0, 50], {'curve': [0.5]}),
         'processes': 1,
+        'cluster': True,
+        'resources.gpus': Proof(0.5, {'cluster': True}),
+        'resources.memory_gib': Proof(2.0, {'cluster': True}),
+        'resources.retries': 3,
+        'time_limit': 1e6,
         'out': 'elsewhere',
     },
     watch_study,

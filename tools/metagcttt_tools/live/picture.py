@@ -139,8 +139,13 @@ class Picture:
             return
         self._goal_values, self._report = (), None  # to be drawn anew
         self._dims = list(self._seen.robot.position_dims)
-        if len(self._dims) != 2 or max(self._dims) >= self._deployed.dataset.obs_dim:
-            self.fault, self._deployed = 'the data have no position to be shown at', None
+        state, obs_dim = self._seen.state, self._deployed.dataset.obs_dim
+        if state is not None and len(state.observation) != obs_dim:
+            self.fault = f'the data are of another robot: {obs_dim} values a state'
+        elif len(self._dims) != 2:
+            self.fault = 'the data have no position to be shown at'
+        if self.fault:
+            self._deployed = None
             return
         self._scene.show_data(self._deployed.dataset.observations[:, self._dims])
 

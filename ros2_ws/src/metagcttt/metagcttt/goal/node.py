@@ -15,10 +15,10 @@ from metagcttt_interfaces.action import ReachGoal
 from metagcttt_interfaces.msg import EpisodeEvent, MazeState, NamedGoal, PolicyStatus
 from nav_msgs.msg import OccupancyGrid
 import numpy as np
-from rclpy.node import Node
 from sim_bridge import describe_environment
 
 from metagcttt.clocks import JumpFreeClock, STEADY
+from metagcttt.conventions import ConventionalNode
 from metagcttt.converters import to_array
 from metagcttt.diagnostics import Diagnostics
 from metagcttt.goal.goals import Catalog, GoalCatalog, RobotState
@@ -46,7 +46,7 @@ from metagcttt.worlds import Moment
 WATCHDOG_PERIOD_S = 0.1
 
 
-class GoalNode(Node):
+class GoalNode(ConventionalNode):
     """Puts poses, action goals and task goals in force, as `GoalTracker` decides."""
 
     def __init__(self, **kwargs: Any) -> None:
@@ -83,7 +83,7 @@ class GoalNode(Node):
         self.create_subscription(
             MazeState,
             'state',
-            self._on_state,  # type: ignore[arg-type] # rclpy gives it the info as well
+            self._on_state,
             profile,
         )
         self.create_subscription(PoseStamped, 'goal_pose', self._on_goal_pose, COMMAND)
@@ -91,7 +91,7 @@ class GoalNode(Node):
         self.create_subscription(
             EpisodeEvent,
             'episode',
-            self._on_event,  # type: ignore[arg-type] # here too
+            self._on_event,
             EVENTS,
         )
         self.create_subscription(PolicyStatus, 'policy_status', self._on_policy, LATCHED)

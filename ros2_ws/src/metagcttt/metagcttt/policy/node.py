@@ -11,6 +11,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool
 import torch
 
+from metagcttt.conventions import ConventionalNode
 from metagcttt.diagnostics import Diagnostics
 from metagcttt.health import Health, Level
 from metagcttt.parameter_set import ParameterSet
@@ -19,7 +20,7 @@ from metagcttt.policy.deployment import load_deployment, warm_up
 from metagcttt.policy.session import inner_loop, PolicySession
 
 
-class PolicyNode(LifecycleNode):
+class PolicyNode(ConventionalNode, LifecycleNode):
     """Loads a policy and its dataset when configured, and acts on goals while active."""
 
     def __init__(self, **kwargs: Any) -> None:

@@ -12,11 +12,12 @@ from metagcttt_core.robot.types import has_header, type_faults
 from metagcttt_interfaces.msg import ActionCommand, MazeState
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
+from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
+from rclpy.duration import Duration
 from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool
 
+from metagcttt.conventions import ConventionalNode
 from metagcttt.converters import state_message, to_array
 from metagcttt.diagnostics import Diagnostics
 from metagcttt.health import Faults, Health, Level, Rate
@@ -28,16 +29,18 @@ from metagcttt.robot.messages import definitions, message_class, profile
 from metagcttt.robot.pilot import Pilot, Situation
 
 WARNING_PERIOD_S = 5.0
+RESTART = Duration(seconds=-1)
 EPISODE = 1
 LEVELS = {'fault': Level.ERROR, 'stop': Level.WARN, 'silent': Level.WARN}
 
 
-class RobotBridgeNode(Node):
+class RobotBridgeNode(ConventionalNode):
     """Publishes a robot's state at the rate of its contract, and the policy's actions as commands.
 
     A robot is never reset, so there is one episode. Observations go by the node's clock, with
     which the contract's `stamp: header` compares the robot's; deadlines of commands go by a steady
-    one, as simulated time may stand still.
+    one, as simulated time may stand still. Where simulated time goes back, the simulation was
+    started again: that is another world, in which no goal is in force.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -50,7 +53,6 @@ class RobotBridgeNode(Node):
             ContractError: If the contract is wrong or its message types do not have its fields.
         """
         super().__init__('robot_bridge_node', **kwargs)
-        self._world_id = secrets.randbits(64) or 1  # 0 stands for none
         self._settings = ParameterSet(self, ROBOT_BRIDGE_NODE, is_configured=lambda: True)
         self._contract = load_contract(Path(self._settings['contract']).expanduser())
         if faults := type_faults(self._contract, definitions):
@@ -58,6 +60,11 @@ class RobotBridgeNode(Node):
         self._fingerprint = self._contract.identity['fingerprint']
         self._observer = Observer(self._contract)
         self._pilot = Pilot(self._contract)
+        self._begin_world()
+        self._jumps = self.get_clock().create_jump_callback(
+            JumpThreshold(min_forward=None, min_backward=RESTART),
+            post_callback=self._on_time_back,
+        )
         self._policies = Senders()
         self._faults = Faults()
         self._rate = Rate()
@@ -92,11 +99,30 @@ class RobotBridgeNode(Node):
             f'{self._contract.act_dim} values at {self._contract.rate_hz:g} Hz'
         )
 
+    def destroy_node(self) -> None:
+        """Stop following the clock, then destroy the node."""
+        self._jumps.unregister()
+        super().destroy_node()
+
     def end_service(self) -> None:
         """Send the last commands; nothing is sent after them."""
         self._ended = True
         for number, command in self._pilot.farewell(time.monotonic_ns()):
             self._send(number, command)
+
+    def _begin_world(self) -> None:
+        """Draw the identity of a world in which nothing was observed yet."""
+        self._world_id = secrets.randbits(64) or 1  # 0 stands for none
+        self._observer.begin_again()
+        self._pilot.forget()
+
+    def _on_time_back(self, jump: TimeJump) -> None:
+        """Begin another world: the simulation of the robot was started again."""
+        self._begin_world()
+        seconds = -jump.delta.nanoseconds / 1e9
+        self.get_logger().warning(
+            f'the clock went back by {seconds:.1f} s: another world begins, and no goal is in it'
+        )
 
     # --- input -------------------------------------------------------------------------------
 

@@ -81,6 +81,11 @@ class Pilot:
         self._action = _Action(values, withheld, query_id, observed_ns, observation)
         return ''
 
+    def forget(self) -> None:
+        """Forget observations and actions, which are of another world now."""
+        self._steps.clear()
+        self._action = None
+
     def situation(self, topic: CommandTopic, now_ns: int) -> Situation:
         """The reason to fall back, or none."""
         action = self._action
