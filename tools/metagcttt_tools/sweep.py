@@ -1,6 +1,7 @@
 """A study: every run of a comparison, from pre-training to success curves."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from itertools import chain
 import math
@@ -10,9 +11,9 @@ from typing import Annotated, Any
 
 from metagcttt_core import MetaConfig
 from metagcttt_core.agents.config import ActorLoss
-from metagcttt_core.config import Settings
+from metagcttt_core.config import error_lines, Settings
 from metagcttt_core.files import read_json
-from pydantic import Field, model_validator
+from pydantic import Field, model_validator, ValidationError
 import tyro
 import yaml
 
@@ -245,13 +246,15 @@ class Study:
     def _pretrain(self, seed: int) -> PretrainSettings:
         values = preset_values(self.settings.base, 'pretrain')
         folder = self.settings.out / f'base-{seed}'
-        return settings_type().model_validate(
-            values | {'seed': seed, 'out': folder, 'resume': True}
-        )
+        with _named(f'preset {self.settings.base}: pretrain'):
+            return settings_type().model_validate(
+                values | {'seed': seed, 'out': folder, 'resume': True}
+            )
 
     def _post_train(self, name: str, arm: Arm, seed: int) -> MetaTrainSettings:
         values = preset_values(self.settings.base, 'meta_train')
-        meta = MetaConfig.model_validate(merged(values.get('meta', {}), arm.meta))
+        with _named(f'meta_train with arms.{name}'):
+            meta = MetaConfig.model_validate(merged(values.get('meta', {}), arm.meta))
         base = self._pretrain(seed).checkpoint_folder
         folder = self.settings.out / f'{name}-{seed}'
         values |= {'meta': meta, 'seed': seed, 'checkpoint': base, 'out': folder, 'resume': True}
@@ -261,7 +264,8 @@ class Study:
         kept.discard(meta.outer_steps)
         if kept:
             values['snapshot_every'] = math.gcd(*kept)
-        return MetaTrainSettings.model_validate(values)
+        with _named(f'meta_train with arms.{name}'):
+            return MetaTrainSettings.model_validate(values)
 
     def _evaluation(
         self, name: str, policies: Sequence[Policy], different: dict[str, Any]
@@ -269,7 +273,18 @@ class Study:
         values = merged(preset_values(self.settings.base, 'evaluate'), different)
         values |= {'checkpoints': checkpoints(policies), 'processes': self.settings.processes}
         values |= {'out': self.settings.out / f'{name}.json', 'resume': True}
-        return EvaluateSettings.model_validate(values), policies
+        with _named(f'evaluate for {name}'):
+            return EvaluateSettings.model_validate(values), policies
+
+
+@contextmanager
+def _named(part: str) -> Iterator[None]:
+    """Says in errors which part of a study has the wrong settings."""
+    try:
+        yield
+    except ValidationError as error:
+        lines = '; '.join(error_lines(error))
+        raise ValueError(f'{part}: {lines}') from error
 
 
 def _jobs(tool: str, runs: Sequence[Any]) -> list[Job]:

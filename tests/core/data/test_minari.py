@@ -312,6 +312,7 @@ def test_d4rl_file_ends_trajectories_by_terminals_and_timeouts(tmp_path):
         ({'terminals': None}, 'has no terminals; found: actions, infos, observations'),
         ({'timeouts': np.zeros(8, bool)}, 'timeouts must have a value for each row'),
         ({'timeouts': np.full(9, 2)}, 'timeouts must hold 0 or 1'),
+        ({'is_last': np.zeros(9, bool)}, 'is_last looks like a mark of trajectories'),
         ({'actions': np.zeros((8, 2))}, 'actions has 8 rows but observations has 9'),
         ({'actions': np.zeros(9)}, 'actions must be numbers of shape'),
     ],
