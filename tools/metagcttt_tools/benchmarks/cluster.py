@@ -307,6 +307,7 @@ def two_machines() -> Iterator[Any]:
         TimeoutError: If a raylet does not start.
     """
     os.environ.setdefault('RAY_USAGE_STATS_ENABLED', '0')
+    import ray
     from ray.cluster_utils import Cluster
 
     cluster = Cluster()
@@ -317,6 +318,7 @@ def two_machines() -> Iterator[Any]:
         cluster.wait_for_nodes(timeout=300)
         yield cluster
     finally:
+        ray.shutdown()  # where this process has connected to it
         cluster.shutdown()
 
 
