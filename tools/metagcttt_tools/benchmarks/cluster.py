@@ -37,7 +37,7 @@ the raylet of a machine, all of these, or the sweep. Prints tables and writes JS
 _VICTIMS = ('program', 'worker', 'raylet', 'machine', 'sweep')
 _MACHINES = 2
 _DEADLINE_S = 1800.0
-_STARTS = 10
+_STARTS = 5
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -202,7 +202,7 @@ class SmallStudy:
             os.kill(worker, signal.SIGKILL)
         if victim in ('raylet', 'machine'):
             os.kill(raylet, signal.SIGKILL)
-            _add_machine(cluster)
+            _add_machine(cluster, num_cpus=1)
         if victim == 'sweep':
             sweep.kill()
             sweep.wait()
@@ -301,27 +301,34 @@ def _random_walks(path: Path) -> Path:
 
 @contextmanager
 def two_machines() -> Iterator[Any]:
-    """A Ray cluster on this machine: a head without cores, and two raylets with one core each."""
+    """A Ray cluster on this machine: a head without cores, and two raylets with one core each.
+
+    Raises:
+        TimeoutError: If a raylet does not start.
+    """
     os.environ.setdefault('RAY_USAGE_STATS_ENABLED', '0')
+    import ray
     from ray.cluster_utils import Cluster
 
-    head = {'num_cpus': 0, 'include_dashboard': False}
-    cluster = Cluster(initialize_head=True, head_node_args=head)
+    cluster = Cluster()
     try:
+        _add_machine(cluster, num_cpus=0, include_dashboard=False)  # the first is the head
         for _ in range(_MACHINES):
-            _add_machine(cluster)
+            _add_machine(cluster, num_cpus=1)
         cluster.wait_for_nodes(timeout=300)
         yield cluster
     finally:
+        ray.shutdown()  # where this process has connected to it
         cluster.shutdown()
 
 
-def _add_machine(cluster: Any) -> None:
+def _add_machine(cluster: Any, **settings: Any) -> None:
     """Ray gives a raylet 30 s to start, which is short where much else runs."""
-    for attempt in range(_STARTS):
+    for _ in range(_STARTS):
         try:
-            cluster.add_node(num_cpus=1)
+            cluster.add_node(**settings)
             return
         except Exception as error:  # Ray raises nothing narrower
-            if 'timed out during startup' not in str(error) or attempt == _STARTS - 1:
+            if 'timed out during startup' not in str(error):
                 raise
+    raise TimeoutError(f'Ray started no machine within its 30 s, {_STARTS} times')
