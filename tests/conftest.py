@@ -1,8 +1,10 @@
 """Settings that all tests share."""
 
 import os
+import resource
 
 from hypothesis import HealthCheck, settings
+import pytest
 import torch
 
 # Results do not depend on how many workers share the machine.
@@ -13,3 +15,15 @@ _UNTIMED = {'deadline': None, 'suppress_health_check': [HealthCheck.too_slow]}
 settings.register_profile('default', derandomize=True, max_examples=100, **_UNTIMED)
 settings.register_profile('thorough', database=None, max_examples=2000, **_UNTIMED)
 settings.load_profile(os.environ.get('HYPOTHESIS_PROFILE', 'default'))
+
+ROOM = 2 << 30
+
+
+@pytest.fixture
+def bounded_memory():
+    """Makes a reader fail that asks for much more memory than small files can fill."""
+    used = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (used + ROOM, limits[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, limits)

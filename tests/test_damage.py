@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import json
 import os
 from pathlib import Path
-import resource
 import shutil
 from typing import Any
 
@@ -43,7 +42,6 @@ from tests.tools.robots.bags import drive, write
 
 ROOT = Path(__file__).parents[1]
 VARIANTS = int(os.environ.get('METAGCTTT_DAMAGE', '60'))
-ROOM = 2 << 30
 
 
 @dataclass
@@ -244,16 +242,6 @@ def damage(content: bytes, rng: np.random.Generator) -> bytes:
             first, second = data[at : at + 4], data[other : other + 4]
             data[at : at + len(second)], data[other : other + len(first)] = second, first
     return bytes(data)
-
-
-@pytest.fixture
-def bounded_memory():
-    """Makes a reader fail that asks for much more memory than the files can fill."""
-    used = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()
-    limits = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (used + ROOM, limits[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_AS, limits)
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 import re
 import shlex
+import shutil
 import subprocess
 
 from markdown_it import MarkdownIt
@@ -14,11 +15,19 @@ import numpy as np
 import pytest
 
 from tests.core.builders import DATA
+from tests.tools.robots.bags import turtlebot, write
 
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = ('README.md', 'CONTRIBUTING.md', 'docs/guide.md', 'docs/faq.md', 'docs/index.md')
+DOCUMENTS = (
+    'README.md',
+    'CONTRIBUTING.md',
+    'docs/guide.md',
+    'docs/data.md',
+    'docs/faq.md',
+    'docs/index.md',
+)
 # What the documents take for granted: before their blocks, and before what prose names.
 BEFORE_BLOCKS = {
     'README.md': ['metagcttt generate --kind stitch'],
@@ -42,11 +51,11 @@ NOT_RUN = {
     r'python3? -m (venv|colcon) .*': 'needs ROS 2 of the machine',
     r'(pip install .*workspace.*|cd ros2_ws.*)': 'needs ROS 2 of the machine',
     r"pip install -c constraints.txt '\.\[mazes,plots\]'": 'make wheel installs the package',
+    r'pip install "metagcttt-core\[tables\]"': 'make wheel installs the package',
     r'metagcttt pretrain --agent huber .*': 'tests/test_examples.py installs the agent',
     r'ros2 (launch|topic|run) .*': 'needs ROS 2 of the machine',
     r'tools/ros2run .*': 'tests/ros/test_documentation.py runs them',
     r'metagcttt download .*': 'needs the network; tests/tools/test_download.py has a stand-in',
-    r'metagcttt (contract check .* --bag|import-bags|inspect) .*': 'tests/tools/robots has bags',
     r'np\.savez.*': 'is of the JAX program',
     r'python -m torch\.distributed\.run .*': 'tests/tools/common/test_session.py runs it',
     r'metagcttt (report|sweep|evaluate-ros)( .*)?': 'tests/tools has them on a small study',
@@ -78,7 +87,27 @@ def workplace(tmp_path: Path) -> Path:
     with np.load(DATA / 'nets_gciql_ant.npz') as arrays:  # stands for the JAX program's file
         params = {key.removeprefix('init.'): arrays[key] for key in arrays if 'init.' in key}
     np.savez(tmp_path / 'params.npz', **params)
+    shutil.copytree(DATA / 'lerobot_pusht', tmp_path / 'pusht')
+    write(tmp_path / 'drive', turtlebot(300))
+    (tmp_path / 'drive.csv').write_text(drive_csv(60))
+    [columns] = re.findall(
+        r'```yaml\n# columns.yaml\n(.*?)```', (ROOT / 'docs/data.md').read_text(), re.S
+    )
+    (tmp_path / 'columns.yaml').write_text(columns)
     return tmp_path
+
+
+def drive_csv(rows: int) -> str:
+    """Twenty drives in circles of different sizes."""
+    lines = ['run,t,x,y,heading,v,w']
+    for run in range(20):
+        for step in range(rows):
+            angle, radius = 0.1 * step, 0.2 + 0.05 * run
+            x, y = radius * np.sin(angle), radius * (1 - np.cos(angle))
+            lines.append(
+                f'{run},{0.1 * step:.1f},{x:.4f},{y:.4f},{angle:.4f},{radius / 5:.4f},1.0'
+            )
+    return '\n'.join(lines) + '\n'
 
 
 def run(command: str, workplace: Path) -> None:

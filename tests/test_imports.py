@@ -7,7 +7,12 @@ import sys
 
 ROOT = Path(__file__).parents[1]
 # The sources, not what set-up installed.
-SOURCES = (ROOT, ROOT / 'tools', ROOT / 'ros2_ws' / 'src' / 'metagcttt')
+SOURCES = (
+    ROOT,
+    ROOT / 'tools',
+    ROOT / 'ros2_ws' / 'src' / 'metagcttt',
+    ROOT / 'ros2_ws' / 'src' / 'metagcttt_robots',
+)
 
 
 def test_imports_between_rooms_point_one_way():

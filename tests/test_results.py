@@ -10,6 +10,7 @@ from metagcttt_tools.common.differences import differences, paired_difference
 from metagcttt_tools.common.evidence import format_evidence, read_evidence
 from metagcttt_tools.common.presets import load_preset
 from metagcttt_tools.common.resume import flat
+from metagcttt_tools.evaluate_offline import correlation, read_success
 import pytest
 import yaml
 
@@ -170,3 +171,16 @@ def test_malformed_evidence_is_refused(tmp_path, change, message):
     with pytest.raises(ValueError, match=re.escape(message)) as caught:
         read_evidence(path)
     assert str(path) in str(caught.value)
+
+
+def test_agreement_of_offline_evaluation_is_that_of_both_results():
+    """The page's table and rank correlations follow from the two files."""
+    offline, page = read('offline.json'), (RESULTS / 'README.md').read_text()
+    found = correlation(offline['results'], read_success(RESULTS / 'offline-simulation.json'))
+    assert found == offline['against']
+    cells = {f'{pair["error"]:.3f}, {pair["success"]:.2f}' for pair in found['pairs']}
+    assert len(found['pairs']) == found['arms'] == 24
+    assert all(f'| {cell} |' in page for cell in cells)
+    for stated in (found['spearman'], found['within_mean']):
+        low, high = f'({stated["low"]:.2f} to {stated["high"]:.2f}', f'{stated["mean"]:.2f}'
+        assert low in page and high in page

@@ -130,7 +130,7 @@ build_workspace() {
   [ ! -f "$stamps/building" ] || rm -rf "$workspace"/{build,install,log}
   rm -f "$stamps/workspace"
   # colcon copies the package of Python modules and leaves those that were renamed or removed.
-  rm -rf "$workspace"/{build,install}/metagcttt
+  rm -rf "$workspace"/{build,install}/metagcttt{,_robots}
   touch "$stamps/building"
   mkdir -p "$workspace/log"
   say "4 of 4: building the ROS workspace (a minute or two; all its output is in $log)"
@@ -155,7 +155,7 @@ link_workspace() {
   {
     printf '%s\n' "$install"/*/lib/python3.*/site-packages
     printf 'import os; os.environ.setdefault("AMENT_PREFIX_PATH", "%s")\n' \
-      "$install/metagcttt:$install/metagcttt_interfaces:$venv"
+      "$install/metagcttt:$install/metagcttt_interfaces:$install/metagcttt_robots:$venv"
   } >"$site/metagcttt_workspace.pth"
 }
 

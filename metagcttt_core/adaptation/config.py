@@ -5,9 +5,7 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from metagcttt_core.config.settings import Settings
-from metagcttt_core.training.config import OptimizerName, Precision
-
-EngineName = Literal['auto', 'kernels', 'analytic', 'eager']
+from metagcttt_core.training.config import EngineName, OptimizerName, Precision
 
 
 class InnerLoopConfig(Settings):

@@ -7,11 +7,10 @@ import math
 import torch
 from torch.profiler import record_function
 
-from metagcttt_core.adaptation.config import EngineName
-from metagcttt_core.adaptation.engine import make_engine
 from metagcttt_core.adaptation.result import Adaptation, AdaptationCancelled, OnStep
 from metagcttt_core.agents.agent import Agent, OptimizerState, TensorBatch
-from metagcttt_core.training.config import OptimizerName, Precision
+from metagcttt_core.training.config import EngineName, OptimizerName, Precision
+from metagcttt_core.training.engine import make_engine
 from metagcttt_core.training.optimizers import make_optimizer
 
 INNER_STEP, TEST_LOSS = 'inner step', 'test loss'

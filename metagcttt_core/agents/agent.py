@@ -143,8 +143,9 @@ class Agent(nn.Module, ABC):
 
     def clone(self) -> Self:
         """An independent copy with equal weights, and the same optimiser state."""
-        # Twice as large as the weights and never changed: shared instead of copied.
-        return copy.deepcopy(self, {id(self.optimizer_state): self.optimizer_state})
+        # Never changed, and as large as the weights or slow to copy: shared.
+        shared = (self.optimizer_state, self.settings)
+        return copy.deepcopy(self, {id(part): part for part in shared})
 
     def log_prob(
         self, observations: Tensor, goals: Tensor, actions: Tensor

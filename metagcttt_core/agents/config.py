@@ -29,7 +29,7 @@ class AgentSettings(AgentOptions):
     """All settings of an agent."""
 
     hidden: tuple[PositiveInt, ...] = Field(
-        (512, 512, 512), min_length=1, description='units of each hidden layer'
+        (512, 512, 512), min_length=1, max_length=64, description='units of each hidden layer'
     )
 
 

@@ -93,7 +93,8 @@ class RepresentedGoalPolicy(MLP):
 def _linear(
     fan_in: int, fan_out: int, scale: float, generator: torch.Generator | None
 ) -> nn.Linear:
-    layer = nn.utils.skip_init(nn.Linear, fan_in, fan_out)
+    device = torch.get_default_device()
+    layer = nn.utils.skip_init(nn.Linear, fan_in, fan_out, device=device)
     limit = math.sqrt(6 * scale / (fan_in + fan_out))
     nn.init.uniform_(layer.weight, -limit, limit, generator=generator)
     nn.init.zeros_(layer.bias)

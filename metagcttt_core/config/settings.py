@@ -1,5 +1,6 @@
 """Base class of all typed settings."""
 
+from collections.abc import Iterable, Iterator
 from difflib import get_close_matches
 from typing import Any
 
@@ -31,13 +32,30 @@ class Settings(BaseModel):
         if isinstance(values, dict):
             for key in values:
                 if key not in cls.model_fields:
-                    close = get_close_matches(str(key), cls.model_fields, n=1)
-                    hint = f'; did you mean {close[0]!r}?' if close else ''
+                    near = nearest_name(str(key), _dotted_names(cls))
+                    hint = f'; did you mean {near!r}?' if near else ''
                     known = ', '.join(cls.model_fields)
                     raise UnknownSettingError(
                         f'{cls.__name__} has no setting {key!r}{hint} (known: {known})', str(key)
                     )
         return values
+
+
+def nearest_name(wrong: str, names: Iterable[str]) -> str:
+    """The name that was probably meant, of dotted ones by their last part; '' if none is near."""
+    by_last_part: dict[str, str] = {}
+    for name in names:
+        by_last_part.setdefault(name.rpartition('.')[2], name)
+    close = get_close_matches(wrong.rpartition('.')[2], by_last_part, n=1)
+    return by_last_part[close[0]] if close else ''
+
+
+def _dotted_names(model: type[BaseModel]) -> Iterator[str]:
+    """All settings, those of the model before those within them."""
+    yield from model.model_fields
+    for name, field in model.model_fields.items():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from (f'{name}.{inner}' for inner in _dotted_names(field.annotation))
 
 
 def error_lines(error: ValidationError) -> list[str]:

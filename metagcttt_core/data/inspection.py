@@ -11,6 +11,9 @@ from metagcttt_core.data.errors import DatasetError
 FAR_OUT = 3.0
 """Interquartile ranges beyond the quartiles from which Tukey calls a value far out."""
 AT_LIMIT = 0.999
+TIME = 'time_s'
+"""The extra of a dataset with the times of its rows, seconds, ascending in a trajectory."""
+_GAP = 1.5  # median steps
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,25 @@ class Column:
 
 
 @dataclass(frozen=True)
+class Pace:
+    """The time between rows, within trajectories.
+
+    Attributes:
+        rate_hz: Rows a second, by the median step.
+        steps_s: The 1st, 50th and 99th percentile of the steps, seconds.
+        gaps: Steps of more than one and a half times the median.
+        longest_s: The longest step, seconds.
+        longest_row: The row that it follows.
+    """
+
+    rate_hz: float
+    steps_s: tuple[float, ...]
+    gaps: int
+    longest_s: float
+    longest_row: int
+
+
+@dataclass(frozen=True)
 class Inspection:
     """What is in a dataset.
 
@@ -46,12 +68,14 @@ class Inspection:
         observations: Their columns.
         actions: Their columns, without the last rows of trajectories, whose actions are not taken.
         repeated_rows: Transitions that leave the whole observation as it is.
+        pace: Rate and gaps; none for data without times.
     """
 
     lengths: NDArray[np.int64]
     observations: list[Column]
     actions: list[Column]
     repeated_rows: int
+    pace: Pace | None
 
 
 def inspect(dataset: TrajectoryDataset) -> Inspection:
@@ -64,7 +88,7 @@ def inspect(dataset: TrajectoryDataset) -> Inspection:
     if not len(steps):
         raise DatasetError(f'{dataset.source or "dataset"}: no transitions')
     following = steps + 1
-    observations = np.asarray(dataset.observations)
+    observations = np.asarray(dataset.states(slice(None)))
     # The last action of a trajectory is stored, but never taken.
     within = steps[~dataset.terminals[following]]
     return Inspection(
@@ -72,6 +96,20 @@ def inspect(dataset: TrajectoryDataset) -> Inspection:
         observations=_columns(observations, steps, following),
         actions=_columns(np.asarray(dataset.actions)[steps], *_positions(steps, within)),
         repeated_rows=int((observations[steps] == observations[following]).all(axis=1).sum()),
+        pace=_pace(dataset.extras[TIME], steps) if TIME in dataset.extras else None,
+    )
+
+
+def _pace(times: np.ndarray, steps: NDArray[np.int64]) -> Pace:
+    seconds = times[steps + 1] - times[steps]
+    low, median, high = np.percentile(seconds, (1, 50, 99)).tolist()
+    longest = int(seconds.argmax())
+    return Pace(
+        rate_hz=1 / median if median > 0 else float('nan'),
+        steps_s=(low, median, high),
+        gaps=int((seconds > _GAP * median).sum()),
+        longest_s=float(seconds[longest]),
+        longest_row=int(steps[longest]),
     )
 
 

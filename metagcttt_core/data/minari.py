@@ -1,15 +1,19 @@
-"""Reading Minari datasets (HDF5) of goal-reaching robots."""
+"""Reading Minari's and D4RL's datasets (HDF5) of goal-reaching robots."""
 
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from metagcttt_core.data.bounds import check_announced, check_memory
+from metagcttt_core.data.checks import END_MARKS
 from metagcttt_core.data.errors import DatasetError
 
 SUFFIXES = ('.hdf5', '.h5')
 _PER_ROW_INFOS = ('qpos', 'qvel')
-_MOST_EXPANSION = 1032  # of deflate
+_LARGEST_CHUNK = 64 << 20
+"""Bytes of a chunk that is larger than its array; HDF5 unpacks whole chunks."""
 
 
 def is_minari(path: Path) -> bool:
@@ -30,11 +34,15 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     gymnasium-robotics, become vectors that begin with the achieved goal: it is put in front unless
     `observation` begins with it anyway. `desired_goal` is left out.
 
+    A file in D4RL's layout has arrays of all rows instead, with `terminals` and `timeouts`.
+
     Args:
-        path: `main_data.hdf5`, the folder `data` that holds it, or the folder above.
+        path: `main_data.hdf5`, the folder `data` that holds it, or the folder above. Or D4RL's
+            file.
 
     Returns:
-        `observations`, `actions` and `terminals`, and `qpos` and `qvel` where it has them.
+        `observations`, `actions` and `terminals`, and `qpos` and `qvel` where it has them; of
+        D4RL's layout other marks of ends and `next_observations`, too.
 
     Raises:
         DatasetError: If there is no such dataset, it is damaged, or an episode does not fit.
@@ -48,7 +56,14 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     file_path = _file_of(path)
     try:
         with h5py.File(file_path, 'r') as file:
-            episodes = [_episode(file, name, file_path) for name in _episode_names(file, path)]
+            if hasattr(file.get('observations'), 'dtype'):
+                return _flat(file, file_path)
+            names, episodes = _episode_names(file, path), []
+            num_bytes = 0
+            for name in names:
+                episodes.append(_episode(file, name, file_path))
+                num_bytes += sum(array.nbytes for array in episodes[-1].values())
+                check_memory(2 * num_bytes, str(file_path))  # they are joined in the end
             return _join(episodes, path)
     except DatasetError:
         raise
@@ -74,8 +89,9 @@ def _episode_names(file: Any, path: Path) -> list[str]:
     numbers = sorted(
         int(name[8:]) for name in file if name.startswith('episode_') and name[8:].isdigit()
     )
-    if missing := sorted(set(range(numbers[-1] if numbers else 0)) - set(numbers)):
-        raise DatasetError(f'{path}: episode {missing[0]} is missing of {numbers[-1] + 1}')
+    for expected, number in enumerate(numbers):
+        if number != expected:
+            raise DatasetError(f'{path}: episode {expected} is missing of {numbers[-1] + 1}')
     return [f'episode_{number}' for number in numbers]
 
 
@@ -100,11 +116,30 @@ def _episode(file: Any, name: str, path: Path) -> dict[str, np.ndarray]:
     return rows
 
 
+def _flat(file: Any, path: Path) -> dict[str, np.ndarray]:
+    """The rows of a file in D4RL's layout."""
+    for required in ('actions', 'terminals'):
+        if required not in file:
+            raise DatasetError(f'{path}: has no {required}; found: {", ".join(file)}')
+    names = ['observations', 'actions', 'next_observations']
+    rows = {name: _array(file, name, path) for name in names if name in file}
+    for name in ('terminals', *END_MARKS):
+        if name in file:
+            node = _member(file, name, path)
+            if getattr(node, 'shape', None) != (len(rows['observations']),):
+                raise DatasetError(f'{path}: {name} must have a value for each row')
+            rows[name] = np.asarray(node[()])
+    return {**rows, **_infos(file, len(rows['observations']), path)}
+
+
 def _infos(group: Any, num_rows: int, path: Path) -> dict[str, np.ndarray]:
     """The states of the physics at each row, where they are; other infos are not looked at."""
-    infos = _member(group, 'infos', path) if 'infos' in group else {}
-    arrays = {name: _array(infos, name, path) for name in _PER_ROW_INFOS if name in infos}
-    return {name: array for name, array in arrays.items() if len(array) == num_rows}
+    infos = _own_member(group, 'infos')
+    return {
+        name: _array(infos, name, path)
+        for name in _PER_ROW_INFOS
+        if hasattr(infos, 'keys') and _is_table(_own_member(infos, name), num_rows)
+    }
 
 
 def _observations(group: Any, path: Path) -> np.ndarray:
@@ -129,37 +164,57 @@ def _observations(group: Any, path: Path) -> np.ndarray:
     return np.concatenate([achieved, observation], axis=1)
 
 
+def _own_member(group: Any, name: str) -> Any:
+    """The member of a group; none where there is no such, or a link to other files or places."""
+    own = type(group.get(name, getlink=True)).__name__ == 'HardLink'
+    return group[name] if own else None
+
+
 def _member(group: Any, name: str, path: Path) -> Any:
-    """The member of a group; links to other files or places are refused."""
-    link = group.get(name, getlink=True)
-    if type(link).__name__ != 'HardLink':
+    """The member of a group that has one of that name; links are refused."""
+    node = _own_member(group, name)
+    if node is None:
         raise DatasetError(f'{path}: {group.name}/{name} is a link, which is not followed')
-    return group[name]
+    return node
+
+
+def _is_table(node: Any, num_rows: int | None = None) -> bool:
+    """True for numbers of shape (rows, numbers)."""
+    shape = getattr(node, 'shape', None) or (0,)
+    return (
+        hasattr(node, 'dtype')
+        and node.dtype.kind in 'fiu'
+        and len(shape) == 2
+        and (shape[0] > 0 if num_rows is None else shape[0] == num_rows)
+    )
 
 
 def _array(group: Any, name: str, path: Path) -> np.ndarray:
     """One stored array of shape (rows, numbers); anything else is refused."""
     node = _member(group, name, path)
     name = f'{group.name[1:]}/{name}'
-    if (
-        not hasattr(node, 'dtype')
-        or node.dtype.kind not in 'fiu'
-        or node.ndim != 2
-        or not len(node)
-    ):
+    if not _is_table(node):
         got = f'{node.dtype} of shape {node.shape}' if hasattr(node, 'dtype') else 'a group'
         raise DatasetError(f'{path}: {name} must be numbers of shape (rows, numbers), got {got}')
-    if node.nbytes > _MOST_EXPANSION * path.stat().st_size:
-        raise DatasetError(f'{path}: {name} announces {node.nbytes} bytes, more than can be there')
+    stored = min(node.id.get_storage_size(), path.stat().st_size)
+    check_announced(node.nbytes, stored, f'{path}: {name}')
+    chunk_bytes = math.prod(node.chunks or ()) * node.dtype.itemsize
+    if chunk_bytes > max(node.nbytes, _LARGEST_CHUNK):
+        raise DatasetError(
+            f'{path}: {name} holds {node.nbytes} bytes in chunks of {chunk_bytes}, which are too '
+            f'large (at most {_LARGEST_CHUNK})'
+        )
+    check_memory(node.nbytes, f'{path}: {name}')
     return np.asarray(node[()])
 
 
 def _join(episodes: list[dict[str, np.ndarray]], path: Path) -> dict[str, np.ndarray]:
     if not episodes:
         raise DatasetError(f'{path}: holds no episodes')
-    fields = episodes[0].keys()
+    everywhere = set.intersection(*(set(episode) for episode in episodes))
+    fields = [name for name in episodes[0] if name in everywhere]  # some may lack infos
     for number, episode in enumerate(episodes):
-        shapes = {name: values.shape[1:] for name, values in episode.items()}
+        shapes = {name: episode[name].shape[1:] for name in fields}
         expected = {name: episodes[0][name].shape[1:] for name in fields}
         if shapes != expected:
             raise DatasetError(

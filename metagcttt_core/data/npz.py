@@ -1,6 +1,8 @@
 """Reading and writing npz files of arrays, without ever unpickling."""
 
 from collections.abc import Mapping, Sequence
+import hashlib
+import io
 import json
 import logging
 import math
@@ -15,6 +17,7 @@ import zlib
 
 import numpy as np
 
+from metagcttt_core.data.bounds import check_announced, check_memory
 from metagcttt_core.data.checks import looks_like_a_mark
 from metagcttt_core.data.errors import DatasetError
 from metagcttt_core.files import atomic_write, claim_folder
@@ -24,6 +27,8 @@ MEMORY_MAP_BYTES = 2 << 30
 
 _DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError)
 _BAD_HEADER = (ValueError, OverflowError, TokenError)
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_LARGEST_HEADER = 12 + 10000  # NumPy reads no larger ones, but would unpack them first
 _log = logging.getLogger(__name__)
 
 
@@ -56,11 +61,11 @@ def read_arrays(
     try:
         with zipfile.ZipFile(path) as archive:
             members = _chosen(path, archive, required)
-            if memory_map is None:
-                memory_map = sum(m.info.file_size for m in members.values()) > MEMORY_MAP_BYTES
-            if memory_map:
+            num_bytes = sum(member.info.file_size for member in members.values())
+            if memory_map or (memory_map is None and num_bytes > MEMORY_MAP_BYTES):
                 folder = _unpack(path, archive, members)
                 return {name: _read(path, name, folder / f'{name}.npy') for name in members}
+            check_memory(num_bytes, str(path))
             return {name: _read(path, name, archive.open(m.info)) for name, m in members.items()}
     except FileNotFoundError as error:
         raise DatasetError(f'{path}: no such file') from error
@@ -132,14 +137,19 @@ def _chosen(path: Path, archive: zipfile.ZipFile, required: Sequence[str]) -> di
 
 def _header(path: Path, name: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> _Member:
     """Shape and type of an array, after checking that as many bytes follow as they need."""
+    if info.compress_type not in _METHODS:
+        raise DatasetError(f'{path}: {name} is compressed by another method than deflate')
+    stored = min(info.compress_size, path.stat().st_size)
+    check_announced(info.file_size, stored, f'{path}: {name}')
     try:
         with archive.open(info) as file:
-            version = np.lib.format.read_magic(file)
-            if version == (1, 0):
-                shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-            else:
-                shape, _, dtype = np.lib.format.read_array_header_2_0(file)
-            num_bytes = info.file_size - file.tell()
+            head = io.BytesIO(file.read(_LARGEST_HEADER))
+        version = np.lib.format.read_magic(head)
+        if version == (1, 0):
+            shape, _, dtype = np.lib.format.read_array_header_1_0(head)
+        else:
+            shape, _, dtype = np.lib.format.read_array_header_2_0(head)
+        num_bytes = info.file_size - head.tell()
     except _DAMAGE as error:
         raise DatasetError(f'{path}: {name} is truncated or damaged ({error})') from error
     except (*_BAD_HEADER, MemoryError, RecursionError) as error:
@@ -172,15 +182,23 @@ def _read(path: Path, name: str, source: Path | IO[bytes]) -> np.ndarray:
 
 def _unpack(path: Path, archive: zipfile.ZipFile, members: Mapping[str, _Member]) -> Path:
     """The archive's arrays as npy files beside it, renewed when the archive changed."""
-    stat = path.stat()
+    content = [(name, m.info.CRC, m.info.file_size) for name, m in sorted(members.items())]
     unpacked = path.with_name(f'{path.stem}.unpacked')
     claim_folder(unpacked)
-    folder = unpacked / f'{stat.st_size:x}-{stat.st_mtime_ns:x}'
+    # By content: a file may change in place and keep its size and time.
+    folder = unpacked / hashlib.sha256(repr(content).encode()).hexdigest()[:16]
     folder.mkdir(exist_ok=True)
-    for name, member in members.items():
+    missing = {
+        name: member
+        for name, member in members.items()
+        if not _is_unpacked(folder / f'{name}.npy', member)
+    }
+    num_bytes = sum(member.info.file_size for member in missing.values())
+    free = shutil.disk_usage(folder).free
+    if num_bytes > free:
+        raise DatasetError(f'{path}: unpacks to {num_bytes} bytes beside it, {free} are free')
+    for name, member in missing.items():
         target = folder / f'{name}.npy'
-        if target.exists() and target.stat().st_size == member.info.file_size:
-            continue
         with tempfile.TemporaryDirectory(dir=folder) as scratch:
             try:
                 extracted = archive.extract(member.info, scratch)
@@ -191,3 +209,7 @@ def _unpack(path: Path, archive: zipfile.ZipFile, members: Mapping[str, _Member]
         if outdated.is_dir() and not outdated.is_symlink() and outdated != folder:
             shutil.rmtree(outdated)
     return folder
+
+
+def _is_unpacked(target: Path, member: _Member) -> bool:
+    return target.exists() and target.stat().st_size == member.info.file_size

@@ -8,7 +8,11 @@ if TYPE_CHECKING:
     from metagcttt_core.evaluation.rollout import Episode, evaluate_success, run_episode
     from metagcttt_core.evaluation.statistics import (
         adaptation_efficiency,
+        interquartile_mean,
+        Interval,
         normalized_auc,
+        probability_of_improvement,
+        stratified_bootstrap,
         success_statistics,
         SuccessStatistics,
     )
@@ -19,7 +23,11 @@ else:
             'rollout': ('Episode', 'evaluate_success', 'run_episode'),
             'statistics': (
                 'adaptation_efficiency',
+                'interquartile_mean',
+                'Interval',
                 'normalized_auc',
+                'probability_of_improvement',
+                'stratified_bootstrap',
                 'success_statistics',
                 'SuccessStatistics',
             ),
@@ -28,10 +36,14 @@ else:
 
 __all__ = [
     'Episode',
+    'Interval',
     'SuccessStatistics',
     'adaptation_efficiency',
     'evaluate_success',
+    'interquartile_mean',
     'normalized_auc',
+    'probability_of_improvement',
     'run_episode',
+    'stratified_bootstrap',
     'success_statistics',
 ]

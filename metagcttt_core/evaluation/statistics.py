@@ -1,6 +1,10 @@
-"""Success statistics and the area under the success curve (paper, appendix E)."""
+"""Success statistics and the area under the success curve (paper, appendix E).
 
-from collections.abc import Mapping, Sequence
+Interquartile means, stratified bootstrap intervals and the probability of improvement are those
+of Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Precipice, 2021.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -35,6 +39,73 @@ def success_statistics(success_rates: Sequence[float]) -> SuccessStatistics:
         raise ValueError(f'success rates must be in [0, 1], got {rates.tolist()}')
     error = float(rates.std(ddof=0) / np.sqrt(len(rates)))
     return SuccessStatistics(float(rates.mean()), error, 1.96 * error, len(rates))
+
+
+class Interval(NamedTuple):
+    """An estimate with the ends of its interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+def interquartile_mean(scores: np.ndarray) -> float:
+    """The mean without the lowest and the highest quarter, each rounded down to whole scores.
+
+    Args:
+        scores: (seeds, tasks) or any other shape; all count alike.
+    """
+    ordered = np.sort(scores, axis=None)
+    cut = len(ordered) // 4
+    return float(ordered[cut : len(ordered) - cut].mean())
+
+
+def probability_of_improvement(scores: np.ndarray, baseline: np.ndarray) -> float:
+    """How likely a run scores more than one of the baseline on the same task.
+
+    The mean over tasks of the Mann-Whitney statistic: a draw counts half, runs are not paired.
+
+    Args:
+        scores: (seeds, tasks).
+        baseline: (its seeds, tasks).
+    """
+    above = scores[:, None] > baseline[None]
+    equal = scores[:, None] == baseline[None]
+    return float((above + 0.5 * equal).mean())
+
+
+def stratified_bootstrap(
+    statistic: Callable[..., float],
+    *scores: np.ndarray,
+    confidence: float = 0.95,
+    repeats: int = 2000,
+    seed: int = 0,
+) -> Interval:
+    """A statistic with its percentile interval over seeds drawn anew for each task.
+
+    Args:
+        statistic: Of as many score matrices.
+        *scores: (seeds, tasks) each; the tasks are the same, and are kept.
+        confidence: Share of the draws inside the interval.
+        repeats: Number of draws.
+        seed: Of the draws.
+
+    Raises:
+        ValueError: If a matrix is not two-dimensional, or empty.
+    """
+    for matrix in scores:
+        if matrix.ndim != 2 or not matrix.size:
+            raise ValueError(f'need scores of shape (seeds, tasks), got {matrix.shape}')
+    rng = np.random.default_rng(seed)
+    draws = [
+        statistic(
+            *(np.take_along_axis(m, rng.integers(len(m), size=m.shape), axis=0) for m in scores)
+        )
+        for _ in range(repeats)
+    ]
+    tail = 50 * (1 - confidence)
+    low, high = np.percentile(draws, [tail, 100 - tail])
+    return Interval(statistic(*scores), float(low), float(high))
 
 
 def normalized_auc(budgets: Sequence[float], success_rates: Sequence[float]) -> float:

@@ -55,7 +55,10 @@ class Numbers(Settings):
         "by the message's own `name` where it has one",
     )
     size: int | None = Field(
-        None, ge=1, description='length of a field that is an array without names of joints'
+        None,
+        ge=1,
+        le=10000,
+        description='length of a field that is an array without names of joints',
     )
 
     @model_validator(mode='after')
@@ -410,7 +413,13 @@ class Contract(Settings):
         """What datasets and checkpoints keep of a contract; compared by `identity_fault`."""
         text = json.dumps(self.meaning, sort_keys=True)
         digest = hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
-        return {'robot': self.robot, 'fingerprint': digest, **self.meaning}
+        return {
+            'robot': self.robot,
+            'fingerprint': digest,
+            'position_dims': list(self.position_dims),
+            'epsilon': self.retrieval.epsilon if self.retrieval else None,
+            **self.meaning,
+        }
 
     @property
     def position_dims(self) -> tuple[int, ...]:
@@ -428,6 +437,11 @@ class Contract(Settings):
     def topics(self) -> list[ObservedTopic | CommandTopic]:
         """All topics, those that are read first."""
         return [*self.observe, *self.act]
+
+    @property
+    def frame_id(self) -> str:
+        """Frame of the observations: that of the first topic that names one; empty: none does."""
+        return next((topic.frame_id for topic in self.observe if topic.frame_id), '')
 
     @property
     def obs_dim(self) -> int:

@@ -80,20 +80,35 @@ def _of_joints(
 
 
 def _heading(field: str, message: Any) -> NDArray[np.float64]:
-    """Cosine and sine of the angle by which a quaternion turns the x axis around z."""
     try:
         q = attrgetter(field)(message)
-        x, y, z, w = _finite(field, np.array([q.x, q.y, q.z, q.w], dtype=np.float64))
+        parts = (q.x, q.y, q.z, q.w)
     except AttributeError as error:
         raise MessageError(f'no quaternion {field} ({error})') from error
-    length = x * x + y * y + z * z + w * w
+    try:
+        return heading(*parts)
+    except MessageError as error:
+        raise MessageError(f'{field} {error}') from error
+
+
+def heading(x: float, y: float, z: float, w: float) -> NDArray[np.float64]:
+    """Cosine and sine of the angle by which a quaternion turns the x axis around z.
+
+    Raises:
+        MessageError: If it is not finite, not of unit length, or has no heading.
+    """
+    q = np.array([x, y, z, w], dtype=np.float64)
+    if not np.isfinite(q).all():
+        raise MessageError(f'is not finite: {q.tolist()}')
+    length = float(q @ q)
     if abs(length - 1.0) > _UNIT_TOLERANCE:
-        raise MessageError(f'{field} is no rotation: its length is {np.sqrt(length):g}, not 1')
-    heading = np.array([1.0 - 2.0 * (y * y + z * z) / length, 2.0 * (w * z + x * y) / length])
-    flat = np.hypot(*heading)
+        raise MessageError(f'is no rotation: its length is {np.sqrt(length):g}, not 1')
+    x, y, z, w = q
+    turned = np.array([1.0 - 2.0 * (y * y + z * z) / length, 2.0 * (w * z + x * y) / length])
+    flat = np.hypot(*turned)
     if flat < _UNIT_TOLERANCE:
-        raise MessageError(f'{field} points straight up or down and has no heading')
-    return heading / flat
+        raise MessageError('points straight up or down and has no heading')
+    return turned / flat
 
 
 def _finite(field: str, numbers: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -23,7 +23,8 @@ class Observer:
 
     A message is measured against the one before: it has to be newer and within reach. Once a topic
     has had no good message for `timeout_s` there is nothing to measure against, so that a robot
-    that was carried away, or whose clock was set back, is observed again after that time.
+    that was carried away is observed again after that time. One whose clock was set back, as a
+    simulation that starts again does, is observed again at once, and never by what came before.
 
     Attributes:
         segment: Counts unbroken stretches of observations from 1; the last one's number.
@@ -54,7 +55,8 @@ class Observer:
         observed = self._topics[topic]
         before = self._newest.get(topic)
         silent_ns = received_ns - before.received_ns if before else 0
-        if observed.align != 'hold' and silent_ns > _nanoseconds(observed.timeout_s):
+        is_stale = silent_ns > _nanoseconds(observed.timeout_s) and observed.align != 'hold'
+        if is_stale or silent_ns < 0:  # less than none: the clock was set back
             before = None
             self._is_broken = True
         try:
@@ -69,6 +71,12 @@ class Observer:
             return f'{topic}: {error}'
         self._newest[topic] = _Reading(np.concatenate(parts), stamp_ns, received_ns)
         return ''
+
+    def begin_again(self) -> None:
+        """Forget what was observed before the clock went back, but for what is held."""
+        kept = self._newest.items()
+        self._newest = {name: each for name, each in kept if self._topics[name].align == 'hold'}
+        self._is_broken = True
 
     def sample(self, now_ns: int) -> NDArray[np.float64] | None:
         """The observation at `now_ns`, shape (obs_dim,); none while a topic is late."""
@@ -89,9 +97,11 @@ class Observer:
                 continue
             is_drop = topic.align == 'drop'
             limit_ns = self._period_ns if is_drop else _nanoseconds(topic.timeout_s)
-            if now_ns - newest.stamp_ns > limit_ns:
-                age_s = (now_ns - newest.stamp_ns) / 1e9
-                return f'{name}: the newest usable message is {age_s:.2f} s old'
+            age_ns = now_ns - newest.stamp_ns
+            if age_ns > limit_ns:
+                return f'{name}: the newest usable message is {age_ns / 1e9:.2f} s old'
+            if age_ns < -_nanoseconds(topic.timeout_s):
+                return f'{name}: the clock is {-age_ns / 1e9:.2f} s before the newest message'
         return ''
 
 

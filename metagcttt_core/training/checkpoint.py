@@ -150,13 +150,9 @@ def load_checkpoint(
         settings = agent_type.settings_type(**index.settings | dict(changes or {}))
     except ValidationError as error:
         raise CheckpointError(f'{folder}: settings: {"; ".join(error_lines(error))}') from error
-    agent = agent_type(index.obs_dim, index.act_dim, settings, torch.Generator())
-    if index.scaling is not None:
-        try:
-            agent.scaling = Scaling.from_json(index.scaling, index.obs_dim, index.act_dim)
-        except (ValueError, TypeError) as error:
-            raise CheckpointError(f'{folder}: {error}') from error
-    own = agent.state_dict()
+    with torch.device('meta'):  # shapes alone: an index may announce more than memory holds
+        shapes = agent_type(index.obs_dim, index.act_dim, settings, torch.Generator('cpu'))
+    own = shapes.state_dict()
     saved = {name[6:]: tensor for name, tensor in tensors.items() if name.startswith('agent.')}
     missing, unknown = sorted(own.keys() - saved.keys()), sorted(saved.keys() - own.keys())
     if missing or unknown:
@@ -175,6 +171,12 @@ def load_checkpoint(
             )
         if not torch.isfinite(saved[name]).all():
             raise CheckpointError(f'{folder}: weight {name} holds a non-finite value')
+    agent = agent_type(index.obs_dim, index.act_dim, settings, torch.Generator())
+    if index.scaling is not None:
+        try:
+            agent.scaling = Scaling.from_json(index.scaling, index.obs_dim, index.act_dim)
+        except (ValueError, TypeError) as error:
+            raise CheckpointError(f'{folder}: {error}') from error
     agent.load_state_dict(saved)
     agent.metadata = dict(index.metadata)
     own_run = index.training is not None and index.training.stage == _PRETRAINING

@@ -6,6 +6,7 @@ from pydantic import Field
 
 from metagcttt_core.config.settings import Settings
 
+EngineName = Literal['auto', 'kernels', 'analytic', 'eager']
 OptimizerName = Literal['adam', 'sgd']
 Precision = Literal['float32', 'bfloat16', 'auto']
 

@@ -51,16 +51,16 @@ class KernelAdam:
         """Go on from the state that `optimizer` has; gradients stay where they are now."""
         (self._group,) = optimizer.param_groups
         parameters = self._group['params']
-        self._count = torch.tensor(0.0)
         for parameter in parameters:
-            state = optimizer.state[parameter]
-            if not state:
-                state['exp_avg'] = torch.zeros_like(parameter)
-                state['exp_avg_sq'] = torch.zeros_like(parameter)
-            else:
-                self._count = state['step']
-            state['step'] = self._count
+            if not optimizer.state[parameter]:
+                optimizer.state[parameter] = {
+                    'step': torch.tensor(0.0),
+                    'exp_avg': torch.zeros_like(parameter),
+                    'exp_avg_sq': torch.zeros_like(parameter),
+                }
         states = [optimizer.state[parameter] for parameter in parameters]
+        self._steps = [state['step'] for state in states]
+        self._taken = int(self._steps[0])
         arrays = [
             parameters,
             [parameter.grad for parameter in parameters],
@@ -78,15 +78,15 @@ class KernelAdam:
 
     def step(self) -> None:
         """Take a step by the gradients."""
-        self._count += 1
-        count = int(self._count)
+        self._taken += 1
+        torch._foreach_add_(self._steps, 1)
         beta1, beta2 = self._group['betas']
         self._kernels.adam(
             *self._arguments,
             beta1,
             beta2,
-            self._group['lr'] / (1 - beta1**count),
-            math.sqrt(1 - beta2**count),
+            self._group['lr'] / (1 - beta1**self._taken),
+            math.sqrt(1 - beta2**self._taken),
             self._group['eps'],
         )
 

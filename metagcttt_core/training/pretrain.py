@@ -1,6 +1,7 @@
 """Offline pre-training: minimise an agent's loss on relabelled batches of the dataset."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 from metagcttt_core.agents.agent import Agent
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.training.config import Precision, PretrainConfig
+from metagcttt_core.training.engine import make_engine
 from metagcttt_core.training.numerics import loss_function
 from metagcttt_core.training.optimizers import make_optimizer
 from metagcttt_core.training.run import TrainingRun
@@ -34,7 +36,7 @@ def pretrain(
         config: Steps, learning rate, batch size.
         seed: Of the batches.
         precision: Of the matrix products; see `loss_function`.
-        compiled: Compile the loss; see `loss_function`.
+        compiled: Compile the loss, by autograd; see `loss_function`. Without, see `make_engine`.
         run: Checkpoints and resume.
         on_step: Told the number of steps done, the losses before the last of them (detached
             tensors) and the agent after it.
@@ -51,12 +53,14 @@ def pretrain(
     relabeller = agent.relabeller(dataset)
     parameters = list(agent.trained_parameters())
     optimizer = make_optimizer('adam', parameters, config.lr)
-    losses = loss_function(agent, precision=precision, compiled=compiled)
-    for step in range(run.restore(agent, optimizer), config.steps):
+    start = run.restore(agent, optimizer)
+    take_step = make_engine('auto', agent, optimizer, parameters, precision=precision).step
+    if compiled:
+        losses = loss_function(agent, precision=precision, compiled=True)
+        take_step = partial(gradient_step, agent, optimizer, parameters, losses=losses)
+    for step in range(start, config.steps):
         batch = relabeller.sample(config.batch_size, np.random.default_rng((seed, step)))
-        loss, parts = gradient_step(
-            agent, optimizer, parameters, agent.tensors(batch), losses=losses
-        )
+        loss, parts = take_step(agent.tensors(batch))
         agent.optimizer_state = optimizer.state_dict()['state']
         on_step(step + 1, {'loss': loss, **parts}, agent)
         run.step_done(agent, optimizer, step + 1, config.steps)

@@ -82,12 +82,17 @@ def start_process(tmp_path: Path, ros_domain: int) -> Iterator[Callable[..., Nod
     started: list[NodeProcess] = []
 
     def start(
-        executable: str, namespace: str = '', **parameters: bool | int | float | str
+        executable: str,
+        namespace: str = '',
+        package: str = 'metagcttt',
+        **parameters: bool | int | float | str,
     ) -> NodeProcess:
         log = tmp_path / f'{len(started)}-{executable}.log'
         # A robot in a namespace has a time of its own, as in two_robots.launch.py.
         remappings = {'__ns': namespace, '/clock': 'clock'} if namespace else {}
-        started.append(NodeProcess(executable, parameters, log, remappings=remappings))
+        started.append(
+            NodeProcess(executable, parameters, log, remappings=remappings, package=package)
+        )
         return started[-1]
 
     yield start

@@ -11,7 +11,7 @@ SOURCES = Path(__file__).parents[2] / 'ros2_ws' / 'src'
 ROOT = SOURCES.parents[1]
 # Not ROS packages; ros2_ws/README.md says how Python gets them.
 FROM_PIP = {'mcap', 'metagcttt_core', 'sim_bridge', 'torch'}
-KEYS = {'numpy': 'python3-numpy'}
+KEYS = {'numpy': 'python3-numpy', 'yaml': 'python3-yaml'}
 
 
 def manifest(package: str) -> ElementTree.Element:
@@ -29,15 +29,23 @@ def imports(folder: Path) -> Iterator[str]:
                 yield str(node.module).split('.')[0]
 
 
-@pytest.mark.parametrize('package', ['metagcttt', 'metagcttt_interfaces'])
+@pytest.mark.parametrize('package', ['metagcttt', 'metagcttt_interfaces', 'metagcttt_robots'])
 def test_version_is_the_project_s(package: str) -> None:
     project = tomllib.loads((ROOT / 'pyproject.toml').read_text())['project']
     assert manifest(package).findtext('version') == project['version']
 
 
-def test_setup_py_has_the_version_of_the_manifest() -> None:
-    version = manifest('metagcttt').findtext('version')
-    assert f"version='{version}'" in (SOURCES / 'metagcttt' / 'setup.py').read_text()
+@pytest.mark.parametrize('package', ['metagcttt', 'metagcttt_robots'])
+def test_setup_py_has_the_version_of_the_manifest(package: str) -> None:
+    version = manifest(package).findtext('version')
+    assert f"version='{version}'" in (SOURCES / package / 'setup.py').read_text()
+
+
+def test_manifest_of_the_robots_names_every_import() -> None:
+    imported = set(imports(SOURCES / 'metagcttt_robots' / 'metagcttt_robots'))
+    needed = imported - set(sys.stdlib_module_names) - {'metagcttt_robots', 'mujoco'}
+    named = {element.text for element in manifest('metagcttt_robots').iter('exec_depend')}
+    assert {KEYS.get(name, name) for name in needed} == named
 
 
 def test_manifest_names_every_import() -> None:

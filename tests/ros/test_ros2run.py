@@ -47,7 +47,9 @@ def test_unknown_executable_lists_those_there_are(path_without_ros: Path) -> Non
 
 def test_unknown_package_lists_those_there_are(path_without_ros: Path) -> None:
     result = ros2run(path_without_ros, 'meta', 'policy_node', AMENT_PREFIX_PATH='')
-    expected = "ros2run: no package 'meta' with executables; there is: metagcttt\n"
+    expected = (
+        "ros2run: no package 'meta' with executables; there is: metagcttt, metagcttt_robots\n"
+    )
     assert (result.returncode, result.stderr) == (1, expected)
 
 

@@ -54,6 +54,29 @@ def test_late_messages_of_a_world_that_is_over_are_refused() -> None:
     assert order.num_worlds == 2
 
 
+def test_world_whose_clock_is_behind_is_taken_once_it_goes_on() -> None:
+    """It runs on another computer, or the clock was set back; waiting for it would take hours."""
+    hour_ns = 3600 * 10**9
+    order = WorldOrder()
+    order.refuse_state(Moment(WORLD, 9, 80), hour_ns)
+    assert order.refuse_start(Moment(OTHER, 1), 1)
+    assert order.refuse_state(Moment(OTHER, 1, 0), 2)
+    assert order.refuse_state(Moment(OTHER, 1, 0), 3)  # lockstep repeats it
+    assert order.refuse_state(Moment(OTHER, 1, 1), 4) == ''
+    assert order.refuse_state(Moment(OTHER, 1, 2), 5) == ''
+    assert (order.now, order.num_worlds) == (Moment(OTHER, 1, 2), 2)
+
+
+def test_late_messages_between_those_of_the_present_world_stay_refused() -> None:
+    order = WorldOrder()
+    order.refuse_state(Moment(WORLD, 9, 80), 100)
+    order.refuse_state(Moment(OTHER, 1, 0), 200)
+    for step in range(1, 9):
+        assert order.refuse_state(Moment(WORLD, 9, 80 + step), 100 + step)
+        assert order.refuse_state(Moment(OTHER, 1, step), 200 + step) == ''
+    assert order.num_worlds == 2
+
+
 def test_start_counts_once_before_or_after_the_first_states() -> None:
     for state_first in (False, True):
         order = WorldOrder()
@@ -97,6 +120,24 @@ def test_present_goes_forward_in_every_world(sent, restart_states: int) -> None:
             assert order.num_worlds == num_before + 1
             assert order.now == moment
             assert order.now.world_id == 0 or order.now.world_id != before.world_id
+
+
+@given(messages, st.sampled_from([0xC, 0]), st.sampled_from([-50, 0, 50]), st.integers(0, 3))
+def test_whoever_goes_on_alone_is_heard_whatever_came_before(
+    sent, world_id: int, published_ns: int, repeats: int
+) -> None:
+    """No clock, no restart and no missed start leaves a source of states unheard."""
+    order = WorldOrder()
+    for is_start, moment, sent_ns in sent:
+        (order.refuse_start if is_start else order.refuse_state)(moment, sent_ns)
+    late = published_ns < 30 and (order.now or Moment(0, 0)).world_id == world_id == 0
+    refusals = [
+        order.refuse_state(Moment(world_id, 1, step), published_ns + step)
+        for step in range(10)
+        for _ in range(1 + repeats * bool(world_id))
+    ]
+    assert refusals[-1] == '' or late
+    assert late or order.now == Moment(world_id, 1, 9)
 
 
 @given(messages)

@@ -2,8 +2,9 @@
 
 import json
 
+from metagcttt_core.files import read_json_lines
 from metagcttt_tools import diagnostics
-from metagcttt_tools.common.run_log import read_metrics, RunLog
+from metagcttt_tools.common.run_log import RunLog
 import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -59,7 +60,7 @@ def test_pictures_are_written_and_shown_in_tensorboard(tmp_path, capsys):
 
 def test_bars_and_shares_are_those_of_the_log(tmp_path):
     write_run(tmp_path)
-    records = read_metrics(tmp_path / 'metrics.jsonl')
+    records = read_json_lines(tmp_path / 'metrics.jsonl')
     over_run, whole = diagnostics.best_steps_picture(records).axes
     heights = [bar.get_height() for bar in whole.patches]
     assert heights == [0.25, 0.25, 0, 0, 0, 0, 0, 0.25, 0.25]
@@ -69,7 +70,7 @@ def test_bars_and_shares_are_those_of_the_log(tmp_path):
 
 def test_inner_losses_are_those_of_start_middle_and_end(tmp_path):
     write_run(tmp_path)
-    panels = diagnostics.inner_losses_picture(read_metrics(tmp_path / 'metrics.jsonl')).axes
+    panels = diagnostics.inner_losses_picture(read_json_lines(tmp_path / 'metrics.jsonl')).axes
     titles = [axes.get_title() for axes in panels]
     assert titles == ['outer steps 1 to 3', 'outer steps 14 to 16', 'outer steps 28 to 30']
     train, test, best = panels[0].get_lines()
@@ -82,7 +83,7 @@ def test_old_logs_and_unfinished_lines_are_read(tmp_path):
     write_run(tmp_path, samples=False)
     with (tmp_path / 'metrics.jsonl').open('a') as file:
         file.write('{"step": 31, "inner/best')
-    assert len(read_metrics(tmp_path / 'metrics.jsonl')) == 30
+    assert len(read_json_lines(tmp_path / 'metrics.jsonl')) == 30
     out = tmp_path / 'pictures'
     diagnostics.main(['--run', str(tmp_path), '--out', str(out), '--no-tensorboard'])
     assert sorted(path.name for path in out.iterdir()) == [

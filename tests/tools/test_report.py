@@ -105,6 +105,27 @@ def test_each_arm_is_paired_with_the_base_policies_of_its_seeds():
     assert efficiency == [4]
 
 
+def test_interquartile_means_and_improvement_where_tasks_are_told_apart(study, capsys):
+    path = study / 'evaluation-ttt.json'
+    evaluation = json.loads(path.read_text())
+    for result in evaluation['results']:
+        for point in result['curve']:
+            rate = point['success']
+            point['per_task'] = {'1': 0.0, '2': rate, '3': rate, '4': 1.0}
+    path.write_text(json.dumps(evaluation))
+    report.main([str(study)])
+    base, reptile = (read_study(study)['adaptations']['ttt'][arm] for arm in ('base', 'reptile'))
+    # Two seeds and four tasks: of 0, 0, .2, .2, .4, .4, 1, 1 the middle four count.
+    assert base['robust']['interquartile_mean'][0] == pytest.approx((0.3, 0.2, 0.4))
+    assert 'improvement' not in base['robust']
+    # Draws on tasks 1 and 4; on 2 and 3 both seeds are above both of the base.
+    assert reptile['robust']['improvement'][0] == pytest.approx((0.75, 0.75, 0.75))
+    text = squeezed(capsys.readouterr().out)
+    assert '| base | 2 | 0.30 [0.20, 0.40] |' in text
+    assert '| 0.70 [0.60, 0.80], P 0.75 [0.75, 0.75] |' in text
+    assert (study / 'report-iqm.png').read_bytes().startswith(b'\x89PNG')
+
+
 def test_curve_ends_at_the_evaluated_snapshot(study):
     path = study / 'manifest.json'
     manifest = json.loads(path.read_text())

@@ -123,8 +123,16 @@ def test_merging_coefficient_is_refused_as_a_rate_of_adam(tmp_path, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGINT])
-def test_interrupted_run_resumes_to_the_same_bits(number, dataset_path, base, tmp_path):
+@pytest.mark.parametrize(
+    ('number', 'status'),
+    [
+        (signal.SIGKILL, -signal.SIGKILL),
+        (signal.SIGINT, 130),
+        (signal.SIGTERM, 75),
+        (signal.SIGUSR1, 75),
+    ],
+)
+def test_interrupted_run_resumes_to_the_same_bits(number, status, dataset_path, base, tmp_path):
     steps = 60
     straight, broken = tmp_path / 'straight', tmp_path / 'broken'
     meta_train.main(meta_arguments(dataset_path, base, straight, steps))
@@ -138,13 +146,29 @@ def test_interrupted_run_resumes_to_the_same_bits(number, dataset_path, base, tm
     )
     wait_for(lambda: (broken / 'checkpoint' / 'checkpoint.json').exists(), process)
     os.kill(process.pid, number)
-    assert process.wait(30) in (-signal.SIGKILL, 130)
+    assert process.wait(30) == status
     interrupted = json.loads((broken / 'checkpoint' / 'checkpoint.json').read_text())
     assert 0 < interrupted['training']['step'] < steps
     meta_train.main([*arguments, '--resume'])
     assert_same_bits(weights(straight / 'checkpoint'), weights(broken / 'checkpoint'))
     logged = [json.loads(line)['step'] for line in (broken / 'metrics.jsonl').open()]
     assert logged == list(range(1, steps + 1))
+
+
+@pytest.mark.parametrize('program', [pretrain, meta_train])
+def test_a_run_at_its_time_limit_wants_another_turn(program, dataset_path, base, tmp_path):
+    def arguments(out):
+        if program is pretrain:
+            return pretrain_arguments(dataset_path, out, steps=3)
+        return meta_arguments(dataset_path, base, out, steps=3)
+
+    program.main(arguments(tmp_path / 'straight'))
+    turns = tmp_path / 'turns'
+    for _ in range(2):  # each turn is over after a step
+        with pytest.raises(SystemExit, match='75'):
+            program.main([*arguments(turns), '--resume', '--time-limit', '1e-9'])
+    program.main(['--out', str(turns), '--resume'])
+    assert_same_bits(weights(turns / 'checkpoint'), weights(tmp_path / 'straight' / 'checkpoint'))
 
 
 def wait_for(condition, process, timeout_s=60):

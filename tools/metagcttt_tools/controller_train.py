@@ -21,10 +21,11 @@ from metagcttt_tools.common.run_log import RunLog
 from metagcttt_tools.common.session import (
     provenance,
     sole_writer,
-    stop_on_signal,
+    time_limit,
     use_threads,
     write_settings,
 )
+from metagcttt_tools.common.stopping import stop_on_signal
 from metagcttt_tools.controller.config import SACConfig
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ Ctrl-C saves and ends; --resume, with no other flag than --out, continues with a
 class TrainControllerSettings(Resumable):
     """Settings of the program."""
 
-    may_change = frozenset({'checkpoint_every', 'log_every', 'decay_steps'})
+    may_change = frozenset({'checkpoint_every', 'log_every', 'decay_steps', 'time_limit'})
     may_grow = frozenset({'steps'})
 
     out: Path = Field(Path('out/ant-controller'), description='folder of the run')
@@ -56,6 +57,7 @@ class TrainControllerSettings(Resumable):
     checkpoint_every: int = Field(20_000, ge=1, description='steps between checkpoints')
     log_every: int = Field(2000, ge=1, description='steps between log lines')
     threads: int = Field(1, ge=1, description='threads for tensor operations')
+    time_limit: float | None = time_limit()
 
     @property
     def checkpoint(self) -> Path:
@@ -219,7 +221,7 @@ def _run(settings: TrainControllerSettings) -> None:
     write_settings(settings.out, settings)
     first = training.replay.added
     with (
-        stop_on_signal() as stop,
+        stop_on_signal(settings.time_limit) as stop,
         RunLog(settings.out, first) as run_log,
         tqdm(total=settings.steps, initial=first, unit='step', desc='ant') as bar,
     ):
@@ -232,5 +234,5 @@ def _run(settings: TrainControllerSettings) -> None:
         finished = training.run(log, stop.is_set)
     if not finished:
         print(f'stopped after step {training.replay.added}; pass --resume to continue')
-        raise SystemExit(130)
+        raise SystemExit(stop.status)
     print(f'controller: {settings.out / "controller"}')

@@ -9,7 +9,8 @@ from tqdm import tqdm
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.resume import Resumable
 from metagcttt_tools.common.run_log import RunLog
-from metagcttt_tools.common.session import sole_writer, stop_on_signal, use_threads, write_settings
+from metagcttt_tools.common.session import sole_writer, time_limit, use_threads, write_settings
+from metagcttt_tools.common.stopping import stop_on_signal
 from metagcttt_tools.controller.recipe import HumanoidTask, STAGES_OF
 
 _DESCRIPTION = """Train a controller of the humanoid (SAC): to walk along a direction or to get up.
@@ -24,7 +25,7 @@ Ctrl-C saves and ends; --resume, with no other flag than --out, continues."""
 class TrainHumanoidSettings(Resumable):
     """Settings of the program."""
 
-    may_change = frozenset({'checkpoint_every', 'log_every', 'threads'})
+    may_change = frozenset({'checkpoint_every', 'log_every', 'threads', 'time_limit'})
 
     out: Path = Field(Path('out/humanoid-controller'), description='folder of the run')
     task: HumanoidTask = Field('walk', description='what to learn')
@@ -33,6 +34,7 @@ class TrainHumanoidSettings(Resumable):
     checkpoint_every: int = Field(2500, ge=1, description='sweeps between checkpoints')
     log_every: int = Field(250, ge=1, description='sweeps between log lines')
     threads: int = Field(1, ge=1, description='threads for tensor operations')
+    time_limit: float | None = time_limit()
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -61,7 +63,7 @@ def _run(settings: TrainHumanoidSettings) -> None:
     write_settings(settings.out, settings)
     first = training.sweep
     with (
-        stop_on_signal() as stop,
+        stop_on_signal(settings.time_limit) as stop,
         RunLog(settings.out, first) as run_log,
         tqdm(total=training.total, initial=first, unit='sweep', desc='humanoid') as bar,
     ):
@@ -74,5 +76,5 @@ def _run(settings: TrainHumanoidSettings) -> None:
         finished = training.run(log, stop.is_set, settings.log_every, settings.checkpoint_every)
     if not finished:
         print(f'stopped after sweep {training.sweep}; pass --resume to continue')
-        raise SystemExit(130)
+        raise SystemExit(stop.status)
     print(f'controller: {settings.out / "controller"}')

@@ -25,6 +25,7 @@ from sim_bridge import make_simulator
 from sim_bridge.generation.workers import end_with_parent
 from tqdm import tqdm
 
+from metagcttt_tools import evaluate_offline
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.job_log import JobLog
 from metagcttt_tools.common.results import markdown_table, start_column
@@ -34,7 +35,8 @@ from metagcttt_tools.common.session import provenance, sole_writer, use_threads
 _DESCRIPTION = """Success of policies by test-time training budget.
 
 Example: metagcttt evaluate --checkpoints out/pretrain/checkpoint out/meta/checkpoint
-Prints a table with standard errors over seeds and writes OUT as JSON.
+Prints a table with standard errors over seeds and writes OUT as JSON. Without a simulator,
+--offline compares with held-out trajectories; evaluate --offline --help has its flags.
 Ctrl-C is safe; --resume, with no other flag than --out, continues."""
 
 
@@ -87,8 +89,12 @@ class EvaluateSettings(ProtocolSettings):
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the program."""
-    settings = parse(EvaluateSettings, _DESCRIPTION, 'evaluate', argv)
+    """Run the program; with `--offline`, that for data without a simulator."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if '--offline' in arguments:
+        evaluate_offline.main([argument for argument in arguments if argument != '--offline'])
+        return
+    settings = parse(EvaluateSettings, _DESCRIPTION, 'evaluate', arguments)
     try:
         with sole_writer(settings.out):
             results = evaluate(settings, settings)

@@ -59,6 +59,6 @@ def main(argv: list[str] | None = None) -> None:
         fail(*str(error).splitlines())
     except DatasetError as error:
         fail(str(error))
-    dataset = join_datasets(datasets)
+    dataset = join_datasets(datasets, contract=contract.identity)
     dataset.save(settings.out)
     print(f'{dataset}: {settings.out}')

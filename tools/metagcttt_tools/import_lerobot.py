@@ -56,11 +56,12 @@ def main(argv: list[str] | None = None) -> None:
     if settings.columns and settings.contract:
         fail('give columns or contract, not both')
     try:
-        columns = DEFAULT_MAP
+        columns, identity = DEFAULT_MAP, None
         if settings.columns:
             columns = load_columns(settings.columns)
         if settings.contract:
             contract = load_contract(settings.contract)
+            identity = contract.identity
             columns = map_of_contract(contract, observed_in=STATE, commanded_in=ACTION)
         found = read_lerobot(
             settings.folder,
@@ -72,6 +73,7 @@ def main(argv: list[str] | None = None) -> None:
         fail(*str(error).splitlines())
     except DatasetError as error:
         fail(str(error))
+    found.dataset.contract = identity
     found.dataset.save(settings.out)
     print(f'{found.dataset}: {settings.out}')
     print('  cut where episode_index changes', *found.in_words(), sep='\n')

@@ -47,6 +47,9 @@ PROGRAMS: dict[str, Program | Group] = {
     'convert': Program('convert', "Convert a policy trained with OGBench's own code."),
     'meta-train': Program('meta_train', 'Meta-post-train a policy (Algorithm 1).'),
     'evaluate': Program('evaluate', 'Success of policies by test-time training budget.'),
+    'evaluate-offline': Program(
+        'evaluate_offline', 'Action error on held-out data, without a simulator.'
+    ),
     'evaluate-ros': Program('evaluate_ros', 'The same, driven through the ROS graph.'),
     'sweep': Program('sweep', 'Run a whole study: training, post-training, evaluation.'),
     'report': Program('report', 'Tables and figures of a study.'),
@@ -61,6 +64,7 @@ PROGRAMS: dict[str, Program | Group] = {
     'top-view': Program('top_view', 'Draw a recording from above, or film it.'),
     'benchmark': Group(
         {
+            'cluster': Program('benchmarks.cluster', 'Overhead of Ray, and studies after kills.'),
             'inner-loop': Program(
                 'benchmarks.inner_loop', 'Milliseconds per inner step, and of JAX.'
             ),

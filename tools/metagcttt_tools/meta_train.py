@@ -50,6 +50,11 @@ class MetaTrainSettings(RunSettings):
     cuda_graphs: bool = Field(True, description='on a GPU, replay captured inner steps')
     log_every: int = Field(10, ge=1, description='outer steps between log lines (means over them)')
 
+    @property
+    def steps(self) -> int:
+        """Steps of the whole run."""
+        return self.meta.outer_steps
+
     def decisive(self) -> dict[str, Any]:
         """The settings that decide the result, with the outer rate that the algorithm takes."""
         return super().decisive() | {'meta.meta_lr': self.meta.outer_lr}

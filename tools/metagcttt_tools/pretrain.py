@@ -70,6 +70,11 @@ class PretrainSettings(RunSettings):
     )
     evaluation_episodes: int = Field(10, ge=1, description='episodes per task of an evaluation')
 
+    @property
+    def steps(self) -> int:
+        """Steps of the whole run."""
+        return self.training.steps
+
     def decisive(self) -> dict[str, Any]:
         """The settings that decide the result, without those of other agents."""
         others = tuple(f'{name}.' for name in AGENTS if name != self.agent)

@@ -1,12 +1,19 @@
 """Tables and figures of a study (paper, figures 3 to 5 and table 1)."""
 
+from collections.abc import Sequence
 from pathlib import Path
 import shlex
 from typing import Any
 
 from metagcttt_core import normalized_auc, success_statistics
 from metagcttt_core.config import error_lines, Settings
-from metagcttt_core.evaluation import adaptation_efficiency
+from metagcttt_core.evaluation import (
+    adaptation_efficiency,
+    interquartile_mean,
+    Interval,
+    probability_of_improvement,
+    stratified_bootstrap,
+)
 from metagcttt_core.files import read_json, write_json
 import numpy as np
 from pydantic import Field, ValidationError
@@ -15,13 +22,14 @@ import tyro
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.differences import differences
 from metagcttt_tools.common.evidence import format_evidence, read_evidence
-from metagcttt_tools.common.manifest import BASE, Evaluation, FILE, Manifest
-from metagcttt_tools.common.results import markdown_table, Results
+from metagcttt_tools.common.manifest import BASE, Evaluation, FILE, Manifest, Policy
+from metagcttt_tools.common.results import markdown_table, Point, Results
 
 _DESCRIPTION = """Tables and figures of a study that metagcttt sweep ran.
 
 Example: metagcttt report out/study --out docs/results/study
-Prints the tables; writes OUT.json, OUT.md, OUT.png and, with a curve, OUT-curve.png.
+Prints the tables; writes OUT.json, OUT.md, OUT.png, interquartile means in OUT-iqm.png where
+results tell tasks apart, and, with a curve, OUT-curve.png.
 With --paper it rebuilds the page on the paper's claims, and tables and figures from the results it
 names, in the folder OUT of paper.yaml."""
 
@@ -31,8 +39,17 @@ _DIFFERENCES = (
     'where all seeds differ equally. Without an interval there is one seed.'
 )
 
+_ROBUST = (
+    'Interquartile mean over training seeds and tasks, with the 95 percent interval of a '
+    'bootstrap that draws seeds within each task; P: how likely a seed of the arm does better on '
+    'a task than one of the base policies, a draw counting half.'
+)
+
 Rates = dict[tuple[str, float], dict[int, dict[int, float]]]
 """Success by arm and fraction of the outer steps, then by training seed, then by budget."""
+
+TaskRates = dict[str, dict[int, list[list[float]]]]
+"""Success by arm, budget, training seed and task."""
 
 
 class ReportSettings(Settings):
@@ -86,11 +103,23 @@ def rebuild(folder: Path) -> str:
 
 def _write_tables_and_figures(report: dict[str, Any], out: Path) -> str:
     """Write OUT.md and the figures; returns the tables."""
-    from metagcttt_tools.common.plots import post_training_curves, save, success_curves
+    from metagcttt_tools.common.plots import (
+        interquartile_picture,
+        post_training_curves,
+        save,
+        success_curves,
+    )
 
     text = format_report(report)
     out.with_suffix('.md').write_text(text, encoding='utf-8')
     save(success_curves(_panels(report['adaptations'])), out.with_suffix('.png'))
+    robust = {
+        name: arms
+        for name, arms in report['adaptations'].items()
+        if any('robust' in arm for arm in arms.values())
+    }
+    if robust:
+        save(interquartile_picture(_panels(robust)), out.with_name(f'{out.name}-iqm.png'))
     if report['curve']:
         save(post_training_curves(report['curve']), out.with_name(f'{out.name}-curve.png'))
     return text
@@ -121,8 +150,9 @@ def read_study(folder: Path, threshold: float = 0.8) -> dict[str, Any]:
         `study` (its settings and versions); `adaptations`: by name of the adaptation and arm the
         `budgets`, `success` (per budget), `standard_error`, `per_seed` (per budget and seed),
         `auc`, `auc_error`, `auc_per_seed` and `efficiency`, against the base policies of the same
-        seeds; `curve`: by arm, the same by fraction of the outer
-        steps, from 0, the base policy, to that of the evaluated one.
+        seeds, and, where results tell tasks apart, `robust`, the interquartile mean and the
+        probability of improvement by budget, each with its interval; `curve`: by arm, the same by
+        fraction of the outer steps, from 0, the base policy, to that of the evaluated one.
 
     Raises:
         ValueError: If the folder holds no finished study; names the file that is missing.
@@ -134,6 +164,8 @@ def read_study(folder: Path, threshold: float = 0.8) -> dict[str, Any]:
         rates = _rates(folder, evaluation)
         evaluated |= dict(rates.keys())
         arms = {arm: _summary(seeds) for (arm, _), seeds in rates.items()}
+        for trained, robust in robust_figures(_task_rates(folder, evaluation)).items():
+            arms[trained]['robust'] = robust
         for arm in arms.values():
             base = _summary({seed: rates[BASE, 0.0][seed] for seed in arm['seeds']})
             efficiency = adaptation_efficiency(_by_budget(base), _by_budget(arm), threshold)
@@ -169,6 +201,25 @@ def _restrict(summary: dict[str, Any], budgets: list[int]) -> dict[str, Any]:
 def _rates(folder: Path, evaluation: Evaluation) -> Rates:
     """The success rates in the file of an evaluation."""
     rates: Rates = {}
+    for policy, curve in _curves(folder, evaluation):
+        points = {point.budget: point.success for point in curve}
+        rates.setdefault((policy.arm, policy.fraction), {})[policy.seed] = points
+    return rates
+
+
+def _task_rates(folder: Path, evaluation: Evaluation) -> TaskRates:
+    """The success rates of each task in the file of an evaluation, where it has them."""
+    rates: TaskRates = {}
+    for policy, curve in _curves(folder, evaluation):
+        for point in curve:
+            if point.per_task:
+                of_arm = rates.setdefault(policy.arm, {}).setdefault(point.budget, [])
+                of_arm.append(list(point.per_task.values()))
+    return rates
+
+
+def _curves(folder: Path, evaluation: Evaluation) -> list[tuple[Policy, Sequence[Point]]]:
+    """Each policy of an evaluation with its results."""
     path = folder / evaluation.file
     try:
         results = Results.model_validate(read_json(path)).results
@@ -181,10 +232,27 @@ def _rates(folder: Path, evaluation: Evaluation) -> Rates:
             f'{path}: holds results of {len(results)} policies, '
             f'{FILE} lists {len(evaluation.policies)}'
         )
-    for policy, result in zip(evaluation.policies, results, strict=True):
-        points = {point.budget: point.success for point in result.curve}
-        rates.setdefault((policy.arm, policy.fraction), {})[policy.seed] = points
-    return rates
+    return [(p, r.curve) for p, r in zip(evaluation.policies, results, strict=True)]
+
+
+def robust_figures(rates: TaskRates) -> dict[str, dict[str, list[Interval]]]:
+    """Interquartile means by arm and budget, and probabilities of improvement over the base."""
+    found: dict[str, dict[str, list[Interval]]] = {}
+    for arm, by_budget in rates.items():
+        scores = {budget: np.array(seeds) for budget, seeds in by_budget.items()}
+        found[arm] = {
+            'interquartile_mean': [
+                stratified_bootstrap(interquartile_mean, each) for each in scores.values()
+            ]
+        }
+        if arm != BASE:
+            found[arm]['improvement'] = [
+                stratified_bootstrap(
+                    probability_of_improvement, each, np.array(rates[BASE][budget])
+                )
+                for budget, each in scores.items()
+            ]
+    return found
 
 
 def _summary(seeds: dict[int, dict[int, float]]) -> dict[str, Any]:
@@ -233,6 +301,8 @@ def format_report(report: dict[str, Any]) -> str:
         if len(arms) > 1:
             parts += [f'## Against the base policies ({name})', _DIFFERENCES]
             parts.append(_difference_table(arms, report['threshold']))
+        if any('robust' in arm for arm in arms.values()):
+            parts += [f'## Interquartile means ({name})', _ROBUST, _robust_table(arms)]
     if report['curve']:
         parts += ['## Success over post-training', _curve_table(report['curve'])]
     return '\n\n'.join(parts) + '\n'
@@ -273,6 +343,28 @@ def _difference_table(arms: dict[str, Any], threshold: float) -> str:
                 }
             )
     return markdown_table(rows)
+
+
+def _robust_table(arms: dict[str, Any]) -> str:
+    def cell(figures: dict[str, Any], index: int) -> str:
+        mean, low, high = figures['interquartile_mean'][index]
+        text = f'{mean:.2f} [{low:.2f}, {high:.2f}]'
+        if 'improvement' in figures:
+            probability, low, high = figures['improvement'][index]
+            text += f', P {probability:.2f} [{low:.2f}, {high:.2f}]'
+        return text
+
+    return markdown_table(
+        [
+            {
+                'policy': name,
+                'seeds': len(arm['seeds']),
+                **{f'K = {k}': cell(arm['robust'], i) for i, k in enumerate(arm['budgets'])},
+            }
+            for name, arm in arms.items()
+            if 'robust' in arm
+        ]
+    )
 
 
 def _curve_table(curve: dict[str, Any]) -> str:

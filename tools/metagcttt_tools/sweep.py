@@ -1,14 +1,11 @@
 """A study: every run of a comparison, from pre-training to success curves."""
 
 from collections.abc import Sequence
-from concurrent.futures import as_completed, ThreadPoolExecutor
+from functools import partial
 from itertools import chain
 import math
 from pathlib import Path
-import signal
-import subprocess
 import sys
-import threading
 from typing import Annotated, Any
 
 from metagcttt_core import MetaConfig
@@ -16,22 +13,25 @@ from metagcttt_core.agents.config import ActorLoss
 from metagcttt_core.config import Settings
 from metagcttt_core.files import read_json
 from pydantic import Field, model_validator
-from tqdm import tqdm
 import tyro
 import yaml
 
 from metagcttt_tools.common.cli import fail, merged, parse, preset_values
 from metagcttt_tools.common.estimate import format_estimate
 from metagcttt_tools.common.manifest import BASE, checkpoints, Evaluation, Manifest, Policy
+from metagcttt_tools.common.run_log import last_step
 from metagcttt_tools.common.session import (
     provenance,
     RunSettings,
     snapshot_folder,
     sole_writer,
-    stop_on_signal,
+    time_limit,
     use_threads,
 )
+from metagcttt_tools.common.stopping import stop_on_signal
 from metagcttt_tools.evaluate import EvaluateSettings
+from metagcttt_tools.jobs.program import Invocation
+from metagcttt_tools.jobs.scheduler import Job, LocalScheduler, Resources, run_all, Scheduler
 from metagcttt_tools.meta_train import MetaTrainSettings
 from metagcttt_tools.pretrain import PretrainSettings, settings_type
 
@@ -81,7 +81,14 @@ class SweepSettings(Settings):
         (), description='fractions of the outer steps at which arms of all seeds are evaluated too'
     )
     curve_budgets: tuple[int, ...] = Field((0, 20), description='budgets K along the curve')
-    processes: int = Field(2, ge=1, description='runs at the same time')
+    processes: int = Field(
+        2, ge=1, description='cores to use: runs at the same time, processes of an evaluation'
+    )
+    cluster: bool = Field(
+        False, description='run on the Ray cluster of RAY_ADDRESS or of this machine'
+    )
+    resources: Resources = Resources()
+    time_limit: float | None = time_limit()
     dry_run: bool = Field(
         False, description='list the runs and the hours they take, by rates measured here'
     )
@@ -111,9 +118,6 @@ def main(argv: list[str] | None = None) -> None:
             study.run()
     except ValueError as error:
         fail(str(error))
-    except KeyboardInterrupt:
-        print('interrupted; run the same command to continue', file=sys.stderr)
-        raise SystemExit(130) from None
     print(f'study: {settings.out}; metagcttt report {settings.out}')
 
 
@@ -173,11 +177,26 @@ class Study:
         out = self.settings.out
         out.mkdir(parents=True, exist_ok=True)
         self.manifest().write(out)
-        with stop_on_signal() as stop:
-            processes = self.settings.processes
-            _run_all('pretrain', self.pretraining, processes, stop)
-            _run_all('meta_train', [run for _, run in self.post_training], processes, stop)
-            _run_all('evaluate', self._not_evaluated(), 1, stop)
+        with stop_on_signal(self.settings.time_limit) as stop:
+            scheduler = self._scheduler()
+            try:
+                for tool, runs in (
+                    ('pretrain', self.pretraining),
+                    ('meta_train', [run for _, run in self.post_training]),
+                    ('evaluate', self._not_evaluated()),
+                ):
+                    run_all(tool, _jobs(tool, runs), scheduler, stop)
+            except KeyboardInterrupt:
+                print('interrupted; run the same command to continue', file=sys.stderr)
+                raise SystemExit(stop.status) from None
+
+    def _scheduler(self) -> Scheduler:
+        settings = self.settings
+        if not settings.cluster:
+            return LocalScheduler(settings.processes, settings.resources.retries)
+        from metagcttt_tools.jobs.cluster import RayScheduler
+
+        return RayScheduler(settings.resources)
 
     def estimate(self) -> str:
         """The runs and the hours that are left of them."""
@@ -253,49 +272,21 @@ class Study:
         return EvaluateSettings.model_validate(values), policies
 
 
-def _run_all(tool: str, runs: Sequence[Any], processes: int, stop: threading.Event) -> None:
-    """Run one tool with each of the settings, some at the same time.
-
-    Raises:
-        KeyboardInterrupt: If `stop` was set; the runs have saved what they did.
-        ValueError: If a run failed.
-    """
-    with (
-        ThreadPoolExecutor(processes) as pool,
-        tqdm(total=len(runs), unit='run', desc=tool) as bar,
-    ):
-        futures = [pool.submit(_run_tool, tool, run, stop) for run in runs]
-        for future in as_completed(futures):
-            if future.exception() is not None:
-                pool.shutdown(wait=False, cancel_futures=True)
-            future.result()
-            bar.update()
-
-
-def _run_tool(tool: str, settings: Any, stop: threading.Event) -> None:
-    """Run one tool with the settings, kept as YAML; its output goes beside them."""
-    path = settings.out.with_suffix('.yaml')
-    path.write_text(
-        yaml.safe_dump({tool: settings.model_dump(mode='json')}, sort_keys=False), encoding='utf-8'
-    )
-    program = [sys.executable, '-m', 'metagcttt_tools', tool.replace('_', '-')]
-    command = [*program, '--preset', str(path)]
-    log_path = path.with_suffix('.log')
-    with log_path.open('a', encoding='utf-8') as log:
-        process = subprocess.Popen(
-            command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
+def _jobs(tool: str, runs: Sequence[Any]) -> list[Job]:
+    """One tool with each of the settings, kept as YAML beside the results."""
+    jobs = []
+    for run in runs:
+        preset = run.out.with_suffix('.yaml')
+        preset.write_text(
+            yaml.safe_dump({tool: run.model_dump(mode='json')}, sort_keys=False), encoding='utf-8'
         )
-        while process.poll() is None:
-            if stop.wait(0.2):
-                process.send_signal(signal.SIGINT)
-                process.wait()
-    if stop.is_set():
-        raise KeyboardInterrupt
-    if process.returncode:
-        last = log_path.read_text(encoding='utf-8').rstrip().splitlines()[-1:]
-        raise ValueError(
-            f'{" ".join(command)} ended with status {process.returncode}: {"".join(last)}'
-        )
+        invocation = Invocation(tool.replace('_', '-'), preset, run.out, Path.cwd())
+        if isinstance(run, EvaluateSettings):
+            jobs.append(Job(invocation, 1, partial(is_evaluated, run), run.processes))
+        else:
+            done = partial(last_step, run.out)
+            jobs.append(Job(invocation, run.steps, done, run.threads, run.device != 'cpu'))
+    return jobs
 
 
 def is_evaluated(settings: EvaluateSettings) -> bool:

@@ -40,6 +40,10 @@ def test_copies_and_dumps_come_back():
             {'stesp': 3},
             "Outer has no setting 'stesp'; did you mean 'steps'? (known: steps, name, inner)",
         ),
+        (
+            {'ratee': 3},
+            "Outer has no setting 'ratee'; did you mean 'inner.rate'? (known: steps, name, inner)",
+        ),
         ({'zzz': 3}, "Outer has no setting 'zzz' (known: steps, name, inner)"),
         (
             {'inner': {'raet': 3}},

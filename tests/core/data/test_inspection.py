@@ -58,3 +58,16 @@ def test_actions_that_are_never_taken_do_not_count():
     assert column.percentiles[0] == 0.25
     assert column.at_limit == 0.25  # the first of four
     assert column.repeated == 0.5  # of 1 to 0.5 and 0.25 to 0.25
+
+
+def test_rates_and_gaps_are_those_within_trajectories():
+    """From the first trajectory to the second there is no step, whatever the time between."""
+    times = np.array([0, 0.1, 0.2, 0.3, 0.7, 9.0, 9.1, 9.2, 9.3])
+    data = TrajectoryDataset.from_arrays(
+        np.arange(9.0)[:, None], np.zeros((9, 1)), terminals_of([5, 4]), {'time_s': times}
+    )
+    pace = inspect(data).pace
+    assert pace.rate_hz == pytest.approx(10)
+    assert (pace.gaps, pace.longest_row) == (1, 3)
+    assert pace.longest_s == pytest.approx(0.4)
+    assert inspect(dataset(np.zeros((3, 1)), np.zeros((3, 1)), [3])).pace is None

@@ -1,6 +1,9 @@
 """Minari datasets: written by Minari's own API, read as rows; and what is refused."""
 
+from pathlib import Path
+import re
 import sys
+from typing import Any
 
 from gymnasium import spaces
 import h5py
@@ -200,6 +203,26 @@ def test_infos_that_nobody_needs_are_left_out(two_episodes):
     assert (dataset.num_episodes, dataset.extras) == (2, {})
 
 
+@pytest.mark.parametrize(
+    'infos',
+    [np.zeros(3), h5py.ExternalLink('elsewhere.hdf5', '/x'), h5py.SoftLink('/nowhere')],
+    ids=['array', 'external', 'soft'],
+)
+def test_infos_that_are_no_group_are_left_out(two_episodes, infos):
+    two_episodes['episode_1/infos'] = infos
+    two_episodes['episode_0/infos/qpos'] = np.array([b'text'] * 6)
+    assert loaded(two_episodes).extras == {}
+
+
+def test_infos_of_some_episodes_only_are_left_out(two_episodes):
+    two_episodes['episode_0/infos/qpos'] = np.zeros((6, 2))
+    for number in range(2):
+        two_episodes[f'episode_{number}/infos/qvel'] = np.ones((6, 3))
+    assert {name: array.shape for name, array in loaded(two_episodes).extras.items()} == {
+        'qvel': (12, 3)
+    }
+
+
 def external(file):
     file['episode_2'] = h5py.ExternalLink('not-copied-along.hdf5', '/episode_0')
 
@@ -221,6 +244,22 @@ def bomb(file):
     file['episode_1'].create_dataset('actions', (10**12, 2), 'f8', chunks=(1000, 2))
 
 
+def unwritten(file):
+    del file['episode_1/actions']
+    file['episode_1'].create_dataset('actions', (5, 2), 'f8')
+
+
+def large_chunks(file):
+    del file['episode_1/actions']
+    options = {'chunks': (1 << 23, 2), 'maxshape': (None, 2), 'compression': 'gzip'}
+    file['episode_1'].create_dataset('actions', (5, 2), 'f8', **options)
+    file['episode_1/actions'][:] = 1
+
+
+def far_number(file):
+    point_episode(file, 10**12)
+
+
 @pytest.mark.parametrize(
     ('oddity', 'message'),
     [
@@ -228,10 +267,56 @@ def bomb(file):
         (soft, 'episode_2 is a link, which is not followed'),
         (array, 'episode_2 must be a group, got an array'),
         (gap, 'episode 2 is missing of 4'),
-        (bomb, 'episode_1/actions announces 16000000000000 bytes, more than can be there'),
+        (far_number, 'episode 2 is missing of 1000000000001'),
+        (bomb, 'episode_1/actions announces 16000000000000 bytes, more than can be in the 0'),
+        (unwritten, 'episode_1/actions announces 80 bytes, more than can be in the 0 stored'),
+        (large_chunks, 'episode_1/actions holds 80 bytes in chunks of 134217728'),
     ],
 )
 def test_odd_episode_is_refused_by_name(two_episodes, oddity, message):
     oddity(two_episodes)
     with pytest.raises(DatasetError, match=rf'main_data\.hdf5: .*{message}'):
         loaded(two_episodes)
+
+
+def d4rl(path: Path, **changes: Any) -> Path:
+    """A file in D4RL's layout: a goal that was reached, then a time-out."""
+    rng = np.random.default_rng(0)
+    arrays = {
+        'observations': rng.normal(size=(9, 4)).astype(np.float32),
+        'actions': rng.uniform(-1, 1, (9, 2)).astype(np.float32),
+        'rewards': np.zeros(9, np.float32),
+        'terminals': np.arange(9) == 3,
+        'timeouts': np.arange(9) == 8,
+        'infos/qpos': rng.normal(size=(9, 2)),
+        **changes,
+    }
+    with h5py.File(path, 'w') as file:
+        for name, array in arrays.items():
+            if array is not None:
+                file[name] = array
+    return path
+
+
+def test_d4rl_file_ends_trajectories_by_terminals_and_timeouts(tmp_path):
+    dataset = TrajectoryDataset.load(d4rl(tmp_path / 'maze2d.hdf5'))
+    assert dataset.episode_ends.tolist() == [3, 8]
+    assert dataset.extras['qpos'].shape == (9, 2)
+    assert sorted(dataset.extras) == ['qpos']
+
+
+@pytest.mark.parametrize(
+    ('changes', 'error'),
+    [
+        ({'timeouts': None}, 'terminals is false on the last row'),
+        ({'terminals': None}, 'has no terminals; found: actions, infos, observations'),
+        ({'timeouts': np.zeros(8, bool)}, 'timeouts must have a value for each row'),
+        ({'timeouts': np.full(9, 2)}, 'timeouts must hold 0 or 1'),
+        ({'actions': np.zeros((8, 2))}, 'actions has 8 rows but observations has 9'),
+        ({'actions': np.zeros(9)}, 'actions must be numbers of shape'),
+    ],
+)
+def test_d4rl_file_that_does_not_fit_is_named(tmp_path, changes, error):
+    path = d4rl(tmp_path / 'maze2d.hdf5', **changes)
+    with pytest.raises(DatasetError, match=f'maze2d.hdf5: .*{re.escape(error)}'):
+        TrajectoryDataset.load(path)

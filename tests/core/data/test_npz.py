@@ -4,6 +4,7 @@ import io
 import os
 import pickle
 import struct
+from types import SimpleNamespace
 import zipfile
 
 from hypothesis import given, settings
@@ -116,8 +117,8 @@ def test_memory_map_is_renewed_when_the_file_changes(tmp_path):
     before = path.stat()
     mapped = TrajectoryDataset.load(path, memory_map=True)
     second.save(path)
-    # The same size and even the same whole second do not hide the change.
-    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
+    # Nor is it hidden by the time.
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
     assert_same(TrajectoryDataset.load(path, memory_map=True), second)
     assert np.array_equal(mapped.observations, first.observations)
     # The old rows take no room.
@@ -255,6 +256,50 @@ def test_array_larger_than_memory_is_refused_by_name(tmp_path):
     for memory_map in (False, True):  # before anything is allocated
         with pytest.raises(DatasetError, match=r'data\.npz: actions is damaged.*does not take 0'):
             TrajectoryDataset.load(path, memory_map=memory_map)
+
+
+@BOTH_WAYS
+def test_sizes_that_the_directory_of_the_archive_announces_take_no_memory(
+    tmp_path, memory_map, bounded_memory
+):
+    path, num_bytes = tmp_path / 'data.npz', 3 << 30
+    header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({num_bytes // 4}, 1), }}"
+    member = npy_with_header(header)
+    write_members(path, actions=member)
+    place = path.read_bytes().rindex(b'actions.npy') - 46 + 24  # uncompressed size, central
+    content = bytearray(path.read_bytes())
+    content[place : place + 4] = (num_bytes + len(member)).to_bytes(4, 'little')
+    path.write_bytes(content)
+    with pytest.raises(DatasetError, match=r'data\.npz: actions announces 322122'):
+        TrajectoryDataset.load(path, memory_map=memory_map)
+
+
+@BOTH_WAYS
+def test_header_of_any_size_takes_no_memory(tmp_path, memory_map, bounded_memory):
+    path, size = tmp_path / 'data.npz', 64 << 20
+    write_members(path)
+    member = b'\x93NUMPY\x02\x00' + size.to_bytes(4, 'little') + bytes(size)
+    with zipfile.ZipFile(path, 'a', zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr('extra.npy', member)
+    with pytest.raises(DatasetError, match=r'data\.npz: extra cannot be read'):
+        TrajectoryDataset.load(path, memory_map=memory_map)
+
+
+def test_other_compression_is_refused(tmp_path):
+    write_members(tmp_path / 'data.npz')
+    with zipfile.ZipFile(tmp_path / 'data.npz', 'a', zipfile.ZIP_BZIP2) as archive:
+        archive.writestr('extra.npy', npy(np.zeros(4)))
+    with pytest.raises(DatasetError, match='extra is compressed by another method than deflate'):
+        TrajectoryDataset.load(tmp_path / 'data.npz')
+
+
+@pytest.mark.parametrize('memory_map', [False, True])
+def test_what_this_machine_cannot_hold_is_refused(tmp_path, memory_map, monkeypatch):
+    write_members(tmp_path / 'data.npz')
+    monkeypatch.setattr('os.sysconf', lambda name: 5)
+    monkeypatch.setattr('shutil.disk_usage', lambda path: SimpleNamespace(free=25))
+    with pytest.raises(DatasetError, match='25 are free' if memory_map else 'machine has 25'):
+        TrajectoryDataset.load(tmp_path / 'data.npz', memory_map=memory_map)
 
 
 @BOTH_WAYS

@@ -6,7 +6,12 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 from metagcttt_core import normalized_auc, success_statistics
-from metagcttt_core.evaluation import adaptation_efficiency
+from metagcttt_core.evaluation import (
+    adaptation_efficiency,
+    interquartile_mean,
+    probability_of_improvement,
+    stratified_bootstrap,
+)
 import numpy as np
 import pytest
 
@@ -127,3 +132,65 @@ def test_adaptation_efficiency_at_another_threshold():
     assert adaptation_efficiency(*curves, threshold=0.4) == 2
     assert adaptation_efficiency(*curves) is None
     assert np.isinf(adaptation_efficiency({5: 0.5}, {0: 0.5}, threshold=0.5))
+
+
+def test_interquartile_mean_by_hand():
+    """Of eight scores the two lowest and the two highest go; of five, one each."""
+    assert interquartile_mean(np.array([[0.0, 1.0, 0.1, 0.9], [0.2, 0.3, 0.4, 0.5]])) == (
+        pytest.approx((0.2 + 0.3 + 0.4 + 0.5) / 4)
+    )
+    assert interquartile_mean(np.array([0.0, 0.3, 0.6, 0.9, 100])) == pytest.approx(0.6)
+    assert interquartile_mean(np.array([0.25])) == 0.25
+
+
+@given(st.lists(RATES, min_size=1, max_size=30))
+def test_interquartile_mean_is_the_trimmed_one_of_scipy(rates):
+    from scipy.stats import trim_mean
+
+    assert interquartile_mean(np.array(rates)) == pytest.approx(trim_mean(rates, 0.25))
+
+
+def test_probability_of_improvement_by_hand():
+    """Task 1: of four pairs three are above, one equal; task 2: none, one equal."""
+    scores = np.array([[0.5, 0.0], [0.9, 0.1]])
+    baseline = np.array([[0.5, 0.1], [0.4, 0.2]])
+    assert probability_of_improvement(scores, baseline) == pytest.approx((3.5 / 4 + 0.5 / 4) / 2)
+    assert probability_of_improvement(scores, scores) == 0.5
+    assert probability_of_improvement(scores[:1], baseline) == pytest.approx((1.5 / 2 + 0) / 2)
+
+
+def test_probability_of_improvement_is_the_statistic_of_mann_and_whitney():
+    from scipy.stats import mannwhitneyu
+
+    rng = np.random.default_rng(0)
+    scores, baseline = rng.integers(0, 5, size=(4, 3)), rng.integers(0, 5, size=(6, 3))
+    expected = [
+        mannwhitneyu(*each).statistic / 24 for each in zip(scores.T, baseline.T, strict=True)
+    ]
+    assert probability_of_improvement(scores, baseline) == pytest.approx(np.mean(expected))
+
+
+def test_bootstrap_draws_seeds_within_each_task():
+    """Tasks differ and seeds do not, so every draw is the same matrix: no spread."""
+    equal = np.tile([0.0, 0.5, 1.0], (4, 1))
+    assert stratified_bootstrap(np.mean, equal) == (0.5, 0.5, 0.5)
+    # Two seeds of one task: the mean of a draw is 0, 0.5 or 1 with probability 1/4, 1/2, 1/4.
+    two = np.array([[0.0], [1.0]])
+    assert stratified_bootstrap(np.mean, two) == (0.5, 0.0, 1.0)
+    assert stratified_bootstrap(np.mean, two, confidence=0.4) == (0.5, 0.5, 0.5)
+
+
+def test_bootstrap_interval_is_that_of_the_normal_distribution_for_many_seeds():
+    scores = np.random.default_rng(0).normal(size=(400, 5))
+    value, low, high = stratified_bootstrap(np.mean, scores)
+    error = scores.std(axis=0).mean() / math.sqrt(scores.size)
+    assert (high - value, value - low) == (
+        pytest.approx(1.96 * error, rel=0.1),
+        pytest.approx(1.96 * error, rel=0.1),
+    )
+    assert stratified_bootstrap(np.mean, scores) == (value, low, high)  # the same draws
+
+
+def test_bootstrap_needs_seeds_and_tasks():
+    with pytest.raises(ValueError, match=r'shape \(seeds, tasks\), got \(3,\)'):
+        stratified_bootstrap(np.mean, np.zeros(3))

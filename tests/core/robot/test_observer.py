@@ -133,6 +133,17 @@ def test_joints_that_do_not_fit_are_refused(message, reason):
     assert observer.sample(0) is None
 
 
+def test_clock_that_was_set_back_leaves_nothing_of_before(observer):
+    """A simulation that starts again is observed at once, and by nothing that is from before."""
+    observer.take('odom', odometry(90 * SECOND, x=1.0), 90 * SECOND)
+    assert observer.sample(90 * SECOND)[0] == 1.0
+    assert observer.sample(SECOND) is None
+    assert observer.late == 'odom: the clock is 89.00 s before the newest message'
+    assert observer.take('odom', odometry(SECOND, x=7.0), SECOND) == ''
+    assert observer.sample(SECOND)[0] == 7.0
+    assert observer.segment == 2
+
+
 @pytest.mark.parametrize(('align', 'usable_s'), [('drop', 0.1), ('asof', 0.5), ('hold', 3600.0)])
 def test_alignment_decides_how_old_a_message_may_be(align, usable_s):
     text = DRIVE.replace('stamp: header', f'stamp: header\n    align: {align}')
@@ -160,3 +171,12 @@ def test_values_are_transformed(how, expected):
     observer = Observer(contract(text))
     assert observer.take('odom', odometry(0, x=4.0), 0) == ''
     np.testing.assert_allclose(observer.sample(0)[: len(expected)], expected, atol=1e-12)
+
+
+def test_what_is_held_outlives_a_clock_that_goes_back():
+    observer = Observer(contract(DRIVE.replace('stamp: header', 'stamp: header\n    align: hold')))
+    observer.take('odom', odometry(90 * SECOND, x=1.0), 90 * SECOND)
+    observer.begin_again()
+    assert observer.sample(SECOND)[0] == 1.0
+    assert observer.take('odom', odometry(SECOND, x=7.0), SECOND) == ''
+    assert observer.sample(SECOND)[0] == 7.0

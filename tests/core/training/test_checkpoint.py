@@ -210,11 +210,19 @@ def test_index_that_is_no_json_is_refused(content, tmp_path):
         load_checkpoint(tmp_path)
 
 
-@pytest.mark.parametrize('content', ['[]', '3', '{}', '{"format": "other", "version": 1}'])
-def test_json_of_another_kind_is_refused(content, tmp_path):
+@pytest.mark.parametrize(
+    ('content', 'message'),
+    [
+        ('[]', 'must hold a JSON object, got list'),
+        ('3', 'must hold a JSON object, got int'),
+        ('{}', 'not a checkpoint of this proj'),
+        ('{"format": "other", "version": 1}', 'not a checkpoint of this proj'),
+    ],
+)
+def test_json_of_another_kind_is_refused(content, message, tmp_path):
     saved_agent(tmp_path)
     (tmp_path / 'checkpoint.json').write_text(content)
-    with pytest.raises(CheckpointError, match=r'checkpoint\.json: not a checkpoint of this proj'):
+    with pytest.raises(CheckpointError, match=rf'checkpoint\.json: {message}'):
         load_checkpoint(tmp_path)
 
 
@@ -250,6 +258,22 @@ def test_wrong_index_is_refused_by_name(changes, message, tmp_path):
     saved_agent(tmp_path)
     change_index(tmp_path, **changes)
     with pytest.raises(CheckpointError, match=message):
+        load_checkpoint(tmp_path)
+
+
+@pytest.mark.parametrize(
+    'changes',
+    [
+        {'obs_dim': 10**10},
+        {'act_dim': 10**10},
+        {'settings': {'hidden': [10**8, 10**8]}},
+        {'settings': {'hidden': [1] * 10**5}},
+    ],
+)
+def test_index_that_announces_huge_networks_takes_no_memory(changes, tmp_path, bounded_memory):
+    saved_agent(tmp_path)
+    change_index(tmp_path, **changes)
+    with pytest.raises(CheckpointError, match=r'the settings ask for|do not fit|at most 64'):
         load_checkpoint(tmp_path)
 
 
@@ -413,7 +437,7 @@ def test_crash_before_the_first_checkpoint_leaves_none(tmp_path, monkeypatch):
     def die(*args, **kwargs):
         raise Crash
 
-    monkeypatch.setattr(checkpoint.json, 'dumps', die)
+    monkeypatch.setattr(checkpoint, 'write_json', die)
     with pytest.raises(Crash):
         saved_agent(tmp_path)
     assert not has_checkpoint(tmp_path)

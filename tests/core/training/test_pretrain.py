@@ -1,8 +1,12 @@
 """Pre-training: learns, repeats, and resumes bit-identically from every step."""
 
+from functools import partial
+
 from metagcttt_core import CheckpointError, load_checkpoint, save_checkpoint, TrajectoryDataset
 from metagcttt_core.agents import AGENTS
 from metagcttt_core.data import GoalRelabeller
+from metagcttt_core.training import pretrain as pretrain_module
+from metagcttt_core.training.engine import make_engine
 from metagcttt_core.training.optimizers import pretrained_state
 from metagcttt_core.training.pretrain import pretrain, PretrainConfig
 from metagcttt_core.training.run import TrainingInterrupted, TrainingRun
@@ -44,6 +48,22 @@ def test_pretraining_leaves_the_given_agent_and_repeats(name):
     assert_changed(first, weights)
     assert_bit_equal(pretrain(agent, dataset, CONFIG, seed=1), weights_of(first))
     assert_changed(pretrain(agent, dataset, CONFIG, seed=2), weights_of(first))
+
+
+@pytest.mark.parametrize('name', ['gcbc', 'gciql'])
+def test_kernels_pretrain_as_autograd_does(name, monkeypatch):
+    agent, dataset = tiny_agent(name), random_dataset()
+    by_kernels = pretrain(agent, dataset, CONFIG)
+    monkeypatch.setattr(pretrain_module, 'make_engine', partial(eagerly, make_engine))
+    by_autograd = pretrain(agent, dataset, CONFIG)
+    for own, expected in zip(by_kernels.parameters(), by_autograd.parameters(), strict=True):
+        torch.testing.assert_close(own, expected, rtol=1e-3, atol=1e-4)
+    moments = [pretrained_state(trained) for trained in (by_kernels, by_autograd)]
+    torch.testing.assert_close(*moments, rtol=1e-3, atol=1e-5)
+
+
+def eagerly(make_engine, name, *arguments, **named):
+    return make_engine('eager', *arguments, **named)
 
 
 @EVERY_AGENT

@@ -271,13 +271,17 @@ def test_goal_node_that_goes_down_ends_the_goal(rig: GoalRig) -> None:
     assert rig.error(sent)[0] == Result.SHUTDOWN
 
 
-def test_every_error_code_is_provoked_here() -> None:
-    source = Path(__file__).read_text(encoding='utf-8')
+def test_every_error_code_is_provoked_here_or_by_a_robot() -> None:
+    here = Path(__file__)
+    files = (here, here.parents[1] / 'robot' / 'test_goals.py')
+    source = ''.join(file.read_text(encoding='utf-8') for file in files)
     definition = (
         Path(__file__)
         .parents[3]
         .joinpath('ros2_ws/src/metagcttt_interfaces/action/ReachGoal.action')
     )
     named = re.findall(r'^uint16 (\w+)=', definition.read_text(encoding='utf-8'), re.MULTILINE)
-    assert len(named) == 16
-    assert [name for name in named if f'Result.{name}' not in source] == []
+    assert len(named) == 19
+    assert [
+        name for name in named if not re.search(rf'Result\.{name}|RESULT\.{name}', source)
+    ] == []

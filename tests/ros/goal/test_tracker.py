@@ -30,7 +30,7 @@ CATALOG = GoalCatalog(
 
 @pytest.fixture
 def tracker() -> GoalTracker:
-    return GoalTracker(CATALOG, 'map', START)
+    return GoalTracker(CATALOG, START)
 
 
 def to(xy=FREE, **fields) -> GoalRequest:
@@ -183,7 +183,7 @@ def test_request_with_an_endless_name_is_refused(tracker: GoalTracker) -> None:
 
 @pytest.mark.parametrize('silence', [(1.5, 0.0), (0.0, 1.5)], ids=['real', 'simulated'])
 def test_realtime_goal_is_lost_by_either_clock(silence: tuple[float, float]) -> None:
-    tracker = GoalTracker(CATALOG, 'map', START, realtime=True)
+    tracker = GoalTracker(CATALOG, START, realtime=True)
     see(tracker, 1)
     tracker.request(to(), START)
     assert not lost(tracker, 0.9, 0.9)
@@ -203,7 +203,7 @@ class Life(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.now = START
-        self.tracker = GoalTracker(CATALOG, 'map', START)
+        self.tracker = GoalTracker(CATALOG, START)
         self.accepted: list[int] = []
         self.ended: list[int] = []
         self.in_force: dict = {}
@@ -334,7 +334,7 @@ class RealtimeLife(Life):
 
     def __init__(self) -> None:
         super().__init__()
-        self.tracker = GoalTracker(CATALOG, 'map', START, realtime=True)
+        self.tracker = GoalTracker(CATALOG, START, realtime=True)
 
 
 TestRealtimeLife = RealtimeLife.TestCase

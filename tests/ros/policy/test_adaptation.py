@@ -8,8 +8,8 @@ from metagcttt.goal_in_force import Goal
 from metagcttt.policy import deployment
 from metagcttt_core import adapt, FilterConfig, make_agent, save_checkpoint, TTTConfig
 from metagcttt_core.adaptation import AdaptationCancelled
-from metagcttt_core.adaptation.engine import AnalyticEngine
 from metagcttt_core.agents.gciql import StateValue
+from metagcttt_core.training.engine import AnalyticEngine
 import numpy as np
 import pytest
 from tests.ros.graph import Graph

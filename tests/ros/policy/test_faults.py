@@ -5,9 +5,11 @@ from pathlib import Path
 
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
+from metagcttt.converters import to_time
 from metagcttt_interfaces.msg import ActionCommand, MazeState
 import numpy as np
 import pytest
+from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 from tests.ros.fault_rig import ERROR, FaultRig, OK, values, WARN
 from tests.ros.graph import EVERY, Graph, RELIABLE
@@ -252,6 +254,19 @@ def sim_rig(make_rig) -> FaultRig:
 def test_simulator_that_vanishes_takes_the_time_with_it(sim_rig: FaultRig) -> None:
     sim_rig.wait_for_zero()
     sim_rig.diagnosed(ERROR, 'the action is zero: no state for ', fresh=False)
+    sim_rig.drive()
+
+
+@pytest.mark.parametrize('now_s', [5.0, 1e6, None], ids=['back', 'ahead', 'stopped'])
+def test_robot_is_driven_whatever_the_clock_does(sim_rig: FaultRig, now_s: float | None) -> None:
+    clock = sim_rig._clock
+    clock.publish(Clock(clock=to_time(10**11)))
+    sim_rig.graph.wait(lambda: sim_rig.node.get_clock().now().nanoseconds == 10**11, 'the time')
+    sim_rig._clock = None  # the states go on alone
+    if now_s is not None:
+        clock.publish(Clock(clock=to_time(round(now_s * 1e9))))
+    sim_rig.drive()
+    sim_rig.wait_for_zero()  # by the steady clock, as nothing else goes on
     sim_rig.drive()
 
 

@@ -298,7 +298,7 @@ def test_recording_of_another_kind_is_refused(tmp_path: Path) -> None:
 
 def test_definition_holds_every_type_in_a_message() -> None:
     text = message_definition('metagcttt_interfaces/msg/MazeState')
-    assert text.startswith('# What the simulator knows')
+    assert text.startswith('# What the simulator')
     for name in ('std_msgs/Header', 'builtin_interfaces/Time', 'geometry_msgs/Point'):
         assert text.count(f'{"=" * 80}\nMSG: {name}\n') == 1
 

@@ -7,12 +7,14 @@ import time
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist
+from metagcttt.converters import to_time
 from metagcttt.robot.node import RobotBridgeNode
 from metagcttt_core.robot import ContractError
 from metagcttt_interfaces.msg import ActionCommand, MazeState
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray
 from std_srvs.srv import SetBool
@@ -32,11 +34,18 @@ def odometry(stamp_ns: int, x: float = 0.0, frame_id: str = 'odom') -> Odometry:
 class Rig:
     """A bridge to a cart, and what it sends."""
 
-    def __init__(self, graph: Graph, folder: Path, text: str = DRIVE) -> None:
+    def __init__(
+        self, graph: Graph, folder: Path, text: str = DRIVE, *, use_sim_time: bool = False
+    ) -> None:
         self.graph = graph
         file = folder / 'robot.yaml'
         file.write_text(text)
-        self.node = graph.add(RobotBridgeNode, contract=str(file), diagnostics_period_s=0.05)
+        self.node = graph.add(
+            RobotBridgeNode,
+            contract=str(file),
+            diagnostics_period_s=0.05,
+            use_sim_time=use_sim_time,
+        )
         self.states: list[MazeState] = graph.collect(MazeState, 'state', ANY)
         self.commands: list[Twist] = graph.collect(Twist, 'cmd_vel', RELIABLE)
         self.diagnostics = graph.collect(DiagnosticArray, '/diagnostics', RELIABLE)
@@ -45,6 +54,7 @@ class Rig:
         graph.wait(self._odometry.get_subscription_count, 'the bridge')
         graph.wait(self._actions.get_subscription_count, 'the bridge')
         self.values, self.query_id, self._answered = [1.0, 0.5], 7, 0
+        self.withheld = False
 
     def send_odometry(self, late_s: float = 0.0, **fields) -> None:
         now_ns = self.graph.node.get_clock().now().nanoseconds
@@ -57,6 +67,7 @@ class Rig:
                 step=self.states[-1].step if step is None else step,
                 query_id=self.query_id,
                 values=self.values,
+                withheld=self.withheld,
                 instance=instance,
             )
         )
@@ -125,7 +136,7 @@ def test_silent_policy_stops_the_robot_until_it_returns(rig: Rig) -> None:
 
 @pytest.mark.parametrize(
     ('change', 'reason'),
-    [({'query_id': 0}, 'no goal'), ({'values': [0.0, 0.0]}, 'the policy keeps the robot still')],
+    [({'query_id': 0}, 'no goal'), ({'withheld': True}, 'the policy keeps the robot still')],
 )
 def test_robot_stands_without_a_goal_and_when_the_policy_says_so(
     rig: Rig, change: dict, reason: str
@@ -195,6 +206,15 @@ def test_second_publisher_of_commands_stops_the_robot_until_it_is_gone(rig: Rig)
     rig.drive()
 
 
+def test_topic_of_another_type_is_named(rig: Rig) -> None:
+    rig.graph.node.destroy_publisher(rig._odometry)
+    other = Graph(rig.graph.context.get_domain_id())  # one participant has one type a topic
+    other.node.create_publisher(Twist, 'odom', RELIABLE)
+    reason = 'odom is published as geometry_msgs/msg/Twist, not nav_msgs/msg/Odometry'
+    rig.drive_until(lambda: rig.is_named(reason), reason, observe=False)
+    other.close()
+
+
 def test_second_policy_stops_the_robot(rig: Rig) -> None:
     rig.drive()
     rig.answer(instance=2)
@@ -260,7 +280,7 @@ def test_commands_stay_within_limits_and_reach_whatever_happens(rig: Rig) -> Non
 def test_joints_are_mapped_by_name_and_start_where_they_are(graph: Graph, tmp_path: Path) -> None:
     file = tmp_path / 'arm.yaml'
     file.write_text(ARM)
-    graph.add(RobotBridgeNode, contract=str(file))
+    bridge = graph.add(RobotBridgeNode, contract=str(file))
     states = graph.collect(MazeState, 'state', ANY)
     targets = graph.collect(Float64MultiArray, 'targets', RELIABLE)
     joints = graph.node.create_publisher(JointState, 'joint_states', RELIABLE)
@@ -279,6 +299,12 @@ def test_joints_are_mapped_by_name_and_start_where_they_are(graph: Graph, tmp_pa
     graph.wait(move, 'a target')
     assert list(states[0].observation) == [0.5, -1.0]
     np.testing.assert_allclose(targets[0].data, [-0.9, 0.6])  # b, a: a tenth of a second on
+
+    def lose_a_joint() -> bool:
+        joints.publish(JointState(name=['b', 'gripper'], position=[-1.0, 0.3]))
+        return 'joint_states: no joint a' in bridge._faults._newest[0]
+
+    graph.wait(lose_a_joint, 'the fault')
 
 
 @pytest.mark.parametrize(
@@ -314,3 +340,41 @@ def test_process_says_farewell_with_zeros(graph: Graph, tmp_path: Path, start_pr
     assert process.stop(signal_number=signal.SIGTERM) == 0
     graph.wait(lambda: commands, 'the farewell')
     assert [(c.linear.x, c.angular.z) for c in commands] == [(0.0, 0.0)]
+
+
+def test_simulation_that_starts_again_is_another_world_observed_at_once(
+    graph: Graph, tmp_path: Path
+) -> None:
+    """What was observed before never is a state, nor its goal in force, after the jump."""
+    rig = Rig(graph, tmp_path, use_sim_time=True)
+    clock = graph.node.create_publisher(Clock, '/clock', RELIABLE)
+    graph.wait(clock.get_subscription_count, 'who follows the clock')
+
+    def play(begin_s: float, x: float, condition: Callable[[], bool], what: str) -> None:
+        now_ns, end = round(begin_s * 1e9), time.monotonic() + 30.0
+        while not condition():
+            assert time.monotonic() < end, f'waited in vain for {what}: {rig.health()}'
+            now_ns += 20 * 10**6
+            clock.publish(Clock(clock=to_time(now_ns)))
+            rig._odometry.publish(odometry(now_ns, x=x))
+            graph.wait_for(0.02)
+
+    play(100.0, 1.0, lambda: len(rig.states) > 3, 'states')
+    rig.answer()
+    play(103.0, 1.0, lambda: any(c.angular.z for c in rig.commands), 'a motion')
+    first = rig.states[-1].world_id
+    rig.states.clear()
+    play(10.0, 5.0, lambda: len(rig.states) > 3, 'states of the new world')
+    new = [state for state in rig.states if state.world_id != first]
+    assert len(new) >= 3
+    assert {state.observation[0] for state in new} == {5.0}
+    assert all(state.header.stamp.sec >= 100 for state in rig.states if state not in new)
+    rig.commands.clear()
+    rig.answer(world_id=first)
+    play(12.0, 5.0, lambda: len(rig.states) > 9, 'more states')
+    assert not any(command.angular.z for command in rig.commands)
+    clock.publish(Clock(clock=to_time(12 * 10**9)))  # stands still from here on
+    graph.wait_for(0.5)
+    standing = len(rig.states)
+    graph.wait_for(0.5)
+    assert len(rig.states) == standing

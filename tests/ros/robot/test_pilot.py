@@ -34,7 +34,7 @@ def test_action_becomes_a_command(pilot: Pilot) -> None:
     [
         (lambda pilot: None, 'silent'),
         (lambda pilot: pilot.take_action(1, 0, FORWARD), 'no_goal'),
-        (lambda pilot: pilot.take_action(1, 7, np.zeros(2)), 'silent'),
+        (lambda pilot: pilot.take_action(1, 7, FORWARD, withheld=True), 'silent'),
         (lambda pilot: pilot.take_action(1, 7, FORWARD), ''),
     ],
 )
@@ -47,6 +47,12 @@ def test_fallback_has_its_case(pilot: Pilot, prepare, expected: str) -> None:
     pilot.stopped = 'stopped'
     assert case(pilot, STEP) == 'stop'
     assert sent(pilot, STEP) == [[0.0, 0.0]]
+
+
+def test_zero_action_is_an_action(pilot: Pilot) -> None:
+    pilot.take_action(1, 7, np.zeros(2))
+    assert case(pilot, STEP) == ''
+    assert sent(pilot, STEP) == [[pytest.approx(0.1), 0.0]]  # the middle of -0.5 to 1
 
 
 def test_action_is_as_old_as_the_observation_it_answers(pilot: Pilot) -> None:

@@ -7,6 +7,7 @@ from metagcttt.policy.node import PolicyNode
 from metagcttt.recorder.node import RecorderNode
 from metagcttt.robot.node import RobotBridgeNode
 from metagcttt_core import save_checkpoint, TrajectoryDataset
+from metagcttt_core.robot import load_contract
 from metagcttt_interfaces.msg import AdaptationReport, GoalQuery
 from metagcttt_tools.main import main
 from nav_msgs.msg import Odometry
@@ -81,6 +82,7 @@ def test_bag_policy_and_bag_again(graph: Graph, tmp_path: Path) -> None:
     arguments = ['--contract', str(contract), '--bags', str(recording)]
     main(['import-bags', *arguments, '--out', str(again)])
     dataset = TrajectoryDataset.load(again)
+    assert dataset.contract == load_contract(contract).identity
     assert dataset.num_transitions > 15
     assert np.ptp(dataset.observations[:, 2:], axis=0).max() > 0
     assert np.abs(dataset.actions).max() <= 1.0

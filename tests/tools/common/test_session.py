@@ -7,13 +7,14 @@ import resource
 import signal
 import subprocess
 import sys
+import time
 
 from metagcttt_core import load_checkpoint, make_agent, save_checkpoint
+from metagcttt_core.files import read_json_lines
 from metagcttt_core.meta.diagnostics import Diagnostics
 from metagcttt_core.meta.registry import META_UPDATES
 from metagcttt_core.training.checkpoint import load_training_state
 from metagcttt_tools import meta_train
-from metagcttt_tools.common.run_log import read_metrics
 import pytest
 from tests.core.builders import maze_walks
 import torch
@@ -80,7 +81,9 @@ def test_full_disk_ends_the_run_and_leaves_the_last_checkpoint(made, tmp_path, m
     assert {p.name: p.read_bytes() for p in (broken / 'checkpoint').iterdir()} == before
     meta_train.main([*arguments(made, broken), '--resume'])
     assert_same_bits(weights(straight), weights(broken))
-    assert [line['step'] for line in read_metrics(broken / 'metrics.jsonl')] == list(range(1, 7))
+    assert [line['step'] for line in read_json_lines(broken / 'metrics.jsonl')] == list(
+        range(1, 7)
+    )
 
 
 def test_folder_that_cannot_be_made_is_one_line(made, tmp_path, capsys):
@@ -111,7 +114,7 @@ def test_diverging_run_names_the_weight_and_what_is_left(made, tmp_path, monkeyp
     assert 'outer step 4: weight actor.mean.bias is not finite' in error
     assert error.endswith('the checkpoint of step 3 is whole')
     assert load_training_state(tmp_path / 'checkpoint').step == 3
-    last = read_metrics(tmp_path / 'metrics.jsonl')[-1]
+    last = read_json_lines(tmp_path / 'metrics.jsonl')[-1]
     assert last['step'] == 4
     assert 'weight actor.mean.bias is not finite' in last['warnings'][0]
 
@@ -119,7 +122,7 @@ def test_diverging_run_names_the_weight_and_what_is_left(made, tmp_path, monkeyp
 def test_run_whose_inner_loops_are_rejected_says_so(made, tmp_path, capsys):
     settings = {'meta.inner-lr': 3.0}  # every step makes the loss worse
     meta_train.main(arguments(made, tmp_path, steps=20, **settings))
-    lines = read_metrics(tmp_path / 'metrics.jsonl')
+    lines = read_json_lines(tmp_path / 'metrics.jsonl')
     (told,) = [line for line in lines if 'warnings' in line]
     assert told['step'] == 20
     assert 'of the inner loops are rejected' in told['warnings'][0]
@@ -133,12 +136,13 @@ def test_unknown_device_is_refused_by_name(made, tmp_path, capsys):
         assert 'must be cpu, cuda or cuda:NUMBER' in capsys.readouterr().err
 
 
-def torchrun(processes, given):
-    """The tool in several processes of one machine."""
-    command = [sys.executable, '-m', 'torch.distributed.run', '--standalone']
-    command += [f'--nproc-per-node={processes}', '-m', 'metagcttt_tools', 'meta-train', *given]
-    environment = {**os.environ, 'OMP_NUM_THREADS': '1'}
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=environment)
+TORCHRUN = (sys.executable, '-m', 'torch.distributed.run', '--standalone')
+ENVIRONMENT = {**os.environ, 'OMP_NUM_THREADS': '1'}
+
+
+def torchrun(processes, given, *options):
+    """The command line of the tool in several processes of one machine."""
+    return [*TORCHRUN, f'--nproc-per-node={processes}', *options, *META_TRAIN[1:], *given]
 
 
 @pytest.mark.slow
@@ -147,7 +151,8 @@ def test_two_processes_give_the_policy_of_one(algorithm, tasks, made, tmp_path):
     settings = {'meta.algorithm': algorithm, 'meta.meta-batch-size': tasks, 'meta.inner-lr': 1e-3}
     alone, shared = tmp_path / 'alone', tmp_path / 'shared'
     meta_train.main(arguments(made, alone, **settings))
-    run = torchrun(2, arguments(made, shared, **settings))
+    command = torchrun(2, arguments(made, shared, **settings))
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=ENVIRONMENT)
     assert run.returncode == 0, run.stderr
     assert run.stdout.count('policy:') == 1
     assert_same_bits(weights(alone), weights(shared))
@@ -155,7 +160,39 @@ def test_two_processes_give_the_policy_of_one(algorithm, tasks, made, tmp_path):
     assert len(list((shared / 'tensorboard').iterdir())) == 1
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_killed_rank_restarts_all_from_the_checkpoint_to_the_same_bits(made, tmp_path):
+    settings = {'meta.algorithm': 'fomaml', 'meta.meta-batch-size': 2, 'checkpoint-every': 3}
+    steps, alone, shared = 150, tmp_path / 'alone', tmp_path / 'shared'
+    meta_train.main(arguments(made, alone, steps, **settings))
+    given = [*arguments(made, shared, steps, **settings), '--resume']
+    with (tmp_path / 'log').open('w+') as log:
+        elastic = subprocess.Popen(
+            torchrun(2, given, '--max-restarts=1'),
+            cwd=ROOT,
+            stdout=log,
+            stderr=log,
+            env=ENVIRONMENT,
+        )
+        children = Path(f'/proc/{elastic.pid}/task/{elastic.pid}/children')
+        while not (shared / 'checkpoint' / 'checkpoint.json').exists():
+            assert elastic.poll() is None, (tmp_path / 'log').read_text()
+            time.sleep(0.01)
+        ranks = [
+            process
+            for process in map(int, children.read_text().split())
+            if b'meta-train' in Path(f'/proc/{process}/cmdline').read_bytes()
+        ]
+        assert len(ranks) == 2
+        os.kill(ranks[1], signal.SIGKILL)
+        assert elastic.wait() == 0, (tmp_path / 'log').read_text()
+    assert 'continues after step' in (tmp_path / 'log').read_text()
+    assert_same_bits(weights(alone), weights(shared))
+    assert without_times(alone) == without_times(shared)
+
+
 def without_times(out):
     """The lines of a run's log that do not depend on the machine's speed."""
-    lines = read_metrics(out / 'metrics.jsonl')
+    lines = read_json_lines(out / 'metrics.jsonl')
     return [{key: line[key] for key in line.keys() - {'time', 'task/filter_ms'}} for line in lines]

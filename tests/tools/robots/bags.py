@@ -72,6 +72,17 @@ def drive(steps: int = 20, speed: float = 0.5) -> list[tuple[str, Any, int]]:
     return found
 
 
+def turtlebot(steps: int) -> list[tuple[str, Any, int]]:
+    """A TurtleBot 3 that drives along x, commanded by stamped messages."""
+    found = []
+    for topic, message, time_ns in drive(steps, speed=0.2):
+        if topic == '/cmd_vel':
+            fields = {'header': header(time_ns, 'base_link'), 'twist': twist(0.2, 0.0)}
+            message = make('geometry_msgs/msg/TwistStamped', **fields)
+        found.append((topic, message, time_ns))
+    return found
+
+
 def write(
     path: Path,
     messages: Iterable[tuple[str, Any, int]],

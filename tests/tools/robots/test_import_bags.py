@@ -1,7 +1,11 @@
 """Bags as people have them become datasets by a contract, and what does not fit it is named."""
 
+from contextlib import closing
 from pathlib import Path
+import sqlite3
 
+import mcap.reader
+import mcap.writer
 from metagcttt_core import TrajectoryDataset
 from metagcttt_tools.main import main
 import numpy as np
@@ -9,6 +13,7 @@ import pytest
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from tests.core.robot.messages import ARM, DRIVE
 from tests.tools.robots.bags import drive, joint_state, make, odometry, STEP, T0, twist, write
+import yaml
 
 
 @pytest.fixture
@@ -35,8 +40,17 @@ def files_of(bag: Path) -> list[Path]:
     return [path for path in bag.iterdir() if path.suffix in ('.mcap', '.db3')]
 
 
-@pytest.mark.parametrize('storage', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
-@pytest.mark.parametrize('compression', [CompressionMode.NONE, CompressionMode.FILE])
+@pytest.mark.parametrize(
+    ('storage', 'compression'),
+    [
+        (StoragePlugin.MCAP, CompressionMode.NONE),
+        (StoragePlugin.MCAP, CompressionMode.FILE),
+        (StoragePlugin.MCAP, CompressionMode.STORAGE),  # zstd chunks inside the file
+        (StoragePlugin.SQLITE3, CompressionMode.NONE),
+        (StoragePlugin.SQLITE3, CompressionMode.FILE),
+        (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
+    ],
+)
 def test_drive_becomes_a_trajectory(contract_file, tmp_path, storage, compression):
     bag = write(tmp_path / 'bag', drive(), storage, compression)
     dataset = convert(contract_file, bag)
@@ -54,6 +68,80 @@ def test_drive_becomes_a_trajectory(contract_file, tmp_path, storage, compressio
 def test_single_file_is_a_bag(contract_file, tmp_path, storage):
     bag = write(tmp_path / 'bag', drive(), storage)
     assert convert(contract_file, *files_of(bag)).num_transitions == 19
+
+
+def test_lz4_chunks_are_read(contract_file, tmp_path):
+    """As `ros2 bag record --storage-preset-profile fastwrite` and MCAP's own tools keep them."""
+    [whole] = files_of(write(tmp_path / 'bag', drive()))
+    packed = tmp_path / 'lz4.mcap'
+    with whole.open('rb') as source, packed.open('wb') as target:
+        reader = mcap.reader.make_reader(source)
+        writer = mcap.writer.Writer(target, compression=mcap.writer.CompressionType.LZ4)
+        writer.start('ros2')
+        schemas, channels = {}, {}
+        for schema, channel, message in reader.iter_messages():
+            if schema.id not in schemas:
+                parts = schema.name, schema.encoding, schema.data
+                schemas[schema.id] = writer.register_schema(*parts)
+            if channel.id not in channels:
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, schemas[schema.id], channel.metadata
+                )
+            number = channels[channel.id]
+            writer.add_message(number, message.log_time, message.data, message.publish_time)
+        writer.finish()
+    assert b'lz4' in packed.read_bytes()
+    assert convert(contract_file, packed).fingerprint == convert(contract_file, whole).fingerprint
+
+
+def test_bag_of_humble_is_read_without_definitions_of_types(contract_file, tmp_path):
+    """Its database has no table of definitions, its metadata are of version 5."""
+    bag = write(tmp_path / 'bag', drive(), StoragePlugin.SQLITE3)
+    expected = convert(contract_file, bag).fingerprint
+    [file] = files_of(bag)
+    with closing(sqlite3.connect(file)) as database, database:
+        database.execute('DROP TABLE message_definitions')
+        database.execute('DROP TABLE schema')
+    metadata = yaml.safe_load((bag / 'metadata.yaml').read_text())
+    information = metadata['rosbag2_bagfile_information']
+    information['version'] = 5
+    del information['ros_distro'], information['custom_data']
+    for each in information['topics_with_message_count']:
+        each['topic_metadata']['offered_qos_profiles'] = ''
+        del each['topic_metadata']['type_description_hash']
+    (bag / 'metadata.yaml').write_text(yaml.safe_dump(metadata))
+    assert convert(contract_file, bag).fingerprint == expected
+    assert convert(contract_file, file).fingerprint == expected
+
+
+def test_split_bag_is_one_recording(contract_file, tmp_path):
+    """No trajectory ends where a file does."""
+    messages = drive(30)
+    expected = convert(contract_file, write(tmp_path / 'whole', messages))
+    parts = [write(tmp_path / f'part{n}', messages[30 * n :][:30]) for n in range(2)]
+    folder = tmp_path / 'split'
+    folder.mkdir()
+    metadata = yaml.safe_load((parts[0] / 'metadata.yaml').read_text())
+    information = metadata['rosbag2_bagfile_information']
+    names, entries = [], []
+    for number, part in enumerate(parts):
+        [file] = files_of(part)
+        names.append(f'split_{number}.mcap')
+        file.rename(folder / names[-1])
+        other = yaml.safe_load((part / 'metadata.yaml').read_text())
+        [entry] = other['rosbag2_bagfile_information']['files']
+        entries.append({**entry, 'path': names[-1]})
+    last = entries[-1]
+    end_ns = last['starting_time']['nanoseconds_since_epoch'] + last['duration']['nanoseconds']
+    start_ns = information['starting_time']['nanoseconds_since_epoch']
+    information.update(relative_file_paths=names, files=entries, message_count=60)
+    information['duration'] = {'nanoseconds': end_ns - start_ns}
+    for each in information['topics_with_message_count']:
+        each['message_count'] = 30
+    (folder / 'metadata.yaml').write_text(yaml.safe_dump(metadata))
+    dataset = convert(contract_file, folder)
+    assert dataset.num_episodes == 1
+    assert dataset.fingerprint == expected.fingerprint
 
 
 def test_bags_follow_one_another_and_robots_have_namespaces(contract_file, tmp_path):

@@ -1,12 +1,15 @@
 """Every setting of the benchmarks, by what they measure and how often; times are left out."""
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
+import sys
+from types import SimpleNamespace
 from typing import Any
 
 import metagcttt_core
 from metagcttt_core.meta import experts
-from metagcttt_tools.benchmarks import inner_loop, meta, retrieval, sim, training
+from metagcttt_tools.benchmarks import cluster, inner_loop, meta, retrieval, sim, training
 from metagcttt_tools.common import plots
 import numpy as np
 import pytest
@@ -180,7 +183,48 @@ BENCHMARK_INNER_LOOP = Walk(
     without_figures(inner_loop, watch_inner_loops),
 )
 
+
+def watch_cluster(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    machines = SimpleNamespace(address='here')
+    patch.setattr(cluster, 'two_machines', lambda: nullcontext(machines))
+    schedulers = SimpleNamespace(RayScheduler=lambda resources: 'Ray')
+    patch.setitem(sys.modules, 'metagcttt_tools.jobs.cluster', schedulers)
+    patch.setenv('RAY_ADDRESS', 'there')
+    patch.setattr(
+        cluster, 'run_all', lambda name, jobs, *_: seen.append((name, [job.size for job in jobs]))
+    )
+
+    class Study:
+        def __init__(self, data, out, steps):
+            self.out = out
+            out.mkdir()
+            seen.append(('study', steps))
+
+        def write(self):
+            pass
+
+        def finish(self, address):
+            pass
+
+        def finish_despite(self, victim, moment, machines):
+            seen.append((victim, moment))
+            return {}
+
+        def results(self):
+            return []
+
+    patch.setattr(cluster, 'SmallStudy', Study)
+
+
+BENCHMARK_CLUSTER = Walk(
+    'benchmark cluster',
+    {'jobs': 3, 'kills': 2},
+    {'out': 'elsewhere.json', 'jobs': 4, 'steps': 300, 'kills': 3, 'seed': 1},
+    without_figures(cluster, watch_cluster),
+)
+
 WALKS = (
+    BENCHMARK_CLUSTER,
     BENCHMARK_INNER_LOOP,
     BENCHMARK_META,
     BENCHMARK_RETRIEVAL,

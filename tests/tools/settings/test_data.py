@@ -28,7 +28,14 @@ from sim_bridge.controllers.direction import BUNDLED
 from sim_bridge.controllers.walk import GoalRun
 from tests.core.builders import DATA, random_dataset
 from tests.core.robot.messages import contract
-from tests.tools.settings.walk import Proof, Seen, ShortSimulator, Walk, walks_through
+from tests.tools.settings.walk import (
+    note_time_limits,
+    Proof,
+    Seen,
+    ShortSimulator,
+    Walk,
+    walks_through,
+)
 import torch.utils.tensorboard
 
 
@@ -218,6 +225,7 @@ INSPECT = Walk(
     {
         'data': '@half.npz',
         'contract': Proof('@cart.yaml', refused='the contract of cart has 4 and 2'),
+        'columns': Proof('@action.yaml', {'data': PUSHT}),
         'coverage': [1, 0],
         'out': 'elsewhere.png',
     },
@@ -308,6 +316,7 @@ def watch_ant_training(patch: pytest.MonkeyPatch, seen: Seen) -> None:
         save(training)
 
     patch.setattr(controller_train.ControllerTraining, 'save', noting)
+    note_time_limits(patch, seen, controller_train)
 
 
 ANT = Walk(
@@ -335,6 +344,7 @@ ANT = Walk(
         'checkpoint_every': 3,
         'log_every': 3,
         'threads': 2,
+        'time_limit': 1e6,
         'sac.lr': 0.1,
         'sac.critic_lr': 0.1,
         'sac.batch_size': 3,
@@ -386,6 +396,7 @@ HUMANOID = Walk(
         'checkpoint_every': 3,
         'log_every': 3,
         'threads': 2,
+        'time_limit': 1e6,
     },
     watch_humanoid_training,
 )

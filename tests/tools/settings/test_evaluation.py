@@ -2,14 +2,17 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+import sys
+from types import ModuleType, SimpleNamespace
 
-from metagcttt_core.evaluation import rollout
-from metagcttt_tools import draw_episodes, evaluate, loss_curves, report, sweep
+from metagcttt_core.evaluation import offline, rollout
+from metagcttt_tools import draw_episodes, evaluate, evaluate_offline, loss_curves, report, sweep
 from metagcttt_tools.common import plots
 import pytest
 from tests.tools.settings.walk import (
     FILTER,
     INNER_LOOP,
+    note_time_limits,
     Proof,
     Seen,
     ShortSimulator,
@@ -25,16 +28,16 @@ WIDE = {'filter.epsilon': 4.0, 'filter.top_percent': 50.0}
 QUICK = {**WIDE, 'ttt.batch_size': 8, 'dataset': '@walks.npz'}
 
 
-def note_adaptations(patch: pytest.MonkeyPatch, seen: Seen) -> None:
-    """The supports, the experts and the actor loss of each adaptation in an episode."""
-    adapt = rollout.adapt
+def note_adaptations(patch: pytest.MonkeyPatch, seen: Seen, module: ModuleType = rollout) -> None:
+    """The supports, the experts and the actor loss of each adaptation."""
+    adapt = module.adapt
 
     def noting(agent, dataset, support, *others, **named):
         adaptation = adapt(agent, dataset, support, *others, **named)
         seen.append((support.indices, adaptation.agent))
         return adaptation
 
-    patch.setattr(rollout, 'adapt', noting)
+    patch.setattr(module, 'adapt', noting)
 
 
 def watch_evaluation(patch: pytest.MonkeyPatch, seen: Seen) -> None:
@@ -76,6 +79,42 @@ EVALUATE = Walk(
     },
     watch_evaluation,
 )
+OFFLINE = Walk(
+    'evaluate-offline',
+    {
+        **QUICK,
+        'checkpoints': ['@gcbc'],
+        'budgets': [2],
+        'processes': 1,
+        'trajectories': 3,
+        'steps_ahead': [9],
+        'held_out_share': 0.2,
+    },
+    {
+        'checkpoints': ['@other'],
+        'dataset': '@half.npz',
+        'held_out': '@half.npz',
+        'held_out_share': 0.5,
+        'trajectories': 4,
+        'queries': 2,
+        'steps_ahead': [8],
+        'budgets': [1],
+        'grid': True,
+        'epsilons': Proof([3.0], {'grid': True}),
+        'lrs': Proof([0.1], {'grid': True}),
+        'against': Proof(['nowhere.json'], refused='nowhere.json: no results'),
+        'seed': 1,
+        'processes': 3,
+        'out': 'elsewhere.json',
+        **under(
+            'ttt',
+            {**TTT, 'horizon': Proof(2, refused='horizon is of episodes')},
+            actor_only=CRITIC,
+        ),
+        **under('filter', FILTER, min_steps=CRITIC),
+    },
+    lambda patch, seen: watch_offline(patch, seen),
+)
 CRITIC_RUN = {'runs': ['@run-critic']}
 SUCCESS_CURVE = Walk(
     'success-curve',
@@ -89,6 +128,17 @@ SUCCESS_CURVE = Walk(
     },
     watch_evaluation,
 )
+
+
+def watch_offline(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    each = evaluate_offline._each
+    patch.setattr(
+        evaluate_offline,
+        '_each',
+        lambda jobs, processes, start: seen.append(processes) or each(jobs, 1, start),
+    )
+    patch.setattr(plots, 'save', lambda figure, path: seen.append(path))
+    note_adaptations(patch, seen, offline)
 
 
 def watch_drawing(patch: pytest.MonkeyPatch, seen: Seen) -> None:
@@ -144,11 +194,19 @@ LOSSES = Walk(
 
 def watch_study(patch: pytest.MonkeyPatch, seen: Seen) -> None:
     patch.setattr(sweep, 'format_estimate', lambda *runs: seen.append(runs))
-    patch.setattr(
-        sweep,
-        '_run_all',
-        lambda tool, runs, processes, stop: seen.append((tool, list(runs), processes)),
+
+    def ran(tool, jobs, scheduler, stop):
+        shown = [(job.invocation.preset.read_text(), job.size, job.cpus) for job in jobs]
+        seen.append((tool, shown, scheduler))
+
+    patch.setattr(sweep, 'run_all', ran)
+    patch.setattr(sweep, 'LocalScheduler', lambda *given: ('local', given))
+    patch.setitem(
+        sys.modules,
+        'metagcttt_tools.jobs.cluster',
+        SimpleNamespace(RayScheduler=lambda resources: ('cluster', resources)),
     )
+    note_time_limits(patch, seen, sweep)
 
 
 ARMS = {'slow': {'meta': {'inner_lr': 1e-6}}}
@@ -164,6 +222,11 @@ STUDY = Walk(
         'curve': [0.5],
         'curve_budgets': Proof([0, 50], {'curve': [0.5]}),
         'processes': 1,
+        'cluster': True,
+        'resources.gpus': Proof(0.5, {'cluster': True}),
+        'resources.memory_gib': Proof(2.0, {'cluster': True}),
+        'resources.retries': 3,
+        'time_limit': 1e6,
         'out': 'elsewhere',
     },
     watch_study,
@@ -189,7 +252,7 @@ REPORT = Walk(
     watch_report,
 )
 
-WALKS = (EVALUATE, SUCCESS_CURVE, DRAW, LOSSES, STUDY, REPORT)
+WALKS = (EVALUATE, OFFLINE, SUCCESS_CURVE, DRAW, LOSSES, STUDY, REPORT)
 
 
 @walks_through(WALKS)

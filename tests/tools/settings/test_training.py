@@ -3,9 +3,18 @@
 from pathlib import Path
 
 import metagcttt_core
-from metagcttt_tools.common import pretraining_metrics
+from metagcttt_tools.common import pretraining_metrics, session
 import pytest
-from tests.tools.settings.walk import FILTER, INNER_LOOP, Proof, Seen, under, Walk, walks_through
+from tests.tools.settings.walk import (
+    FILTER,
+    INNER_LOOP,
+    note_time_limits,
+    Proof,
+    Seen,
+    under,
+    Walk,
+    walks_through,
+)
 
 RUN = {
     'resume': Proof(True, again=True),
@@ -17,6 +26,7 @@ RUN = {
     'threads': 2,
     'device': Proof('cuda:99', refused='must be cpu, cuda or cuda:NUMBER'),
     'snapshot_every': 1,
+    'time_limit': 1e6,
 }
 
 
@@ -30,6 +40,7 @@ def note_saves(patch: pytest.MonkeyPatch, seen: Seen) -> None:
         save(agent, path, training)
 
     patch.setattr(run, 'save_checkpoint', noting)
+    note_time_limits(patch, seen, session)
 
 
 def watch_pretraining(patch: pytest.MonkeyPatch, seen: Seen) -> None:
@@ -75,6 +86,7 @@ PRETRAIN = Walk(
         **RUN,
         'environment': 'pointmaze-large-v0',
         'agent': 'gciql',
+        'standardise': 'yes',
         'hidden': [4],
         'gcbc.const_std': False,
         'gcbc.discount': Proof(0.5, {'gcbc.goals.value': None, **GEOMETRIC}),

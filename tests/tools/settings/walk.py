@@ -130,6 +130,17 @@ class Walk:
         return str(self._places / value[1:]) if at_place else value
 
 
+def note_time_limits(patch: pytest.MonkeyPatch, seen: Seen, module: Any) -> None:
+    """The time limit of a run; one short enough to end it would end the walk's program as well."""
+    stop_on_signal = module.stop_on_signal
+
+    def noting(time_limit=None):
+        seen.append(('time limit', time_limit))
+        return stop_on_signal(time_limit)
+
+    patch.setattr(module, 'stop_on_signal', noting)
+
+
 def program_of(name: str) -> Any:
     """The module of a subcommand such as `benchmark sim`."""
     *group, last = name.split()

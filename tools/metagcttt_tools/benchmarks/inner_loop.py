@@ -177,5 +177,5 @@ def picture(rows: list[dict[str, Any]]) -> Figure:
     axes.invert_yaxis()
     axes.axvline(1, color='black', linewidth=0.8)
     axes.set_xlabel('time of an inner step, in that of the eager engine')
-    axes.legend()
+    axes.legend(loc='upper left', bbox_to_anchor=(1, 1))
     return figure

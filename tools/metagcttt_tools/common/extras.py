@@ -13,6 +13,7 @@ EXTRAS = {
     'mujoco': 'mazes',
     'ogbench': 'mazes',
     'pyarrow': 'tables',
+    'ray': 'cluster',
     'rosbags': 'recordings',
     'scipy': 'plots',
     'tensorboard': 'plots',

@@ -1,6 +1,7 @@
 """Pictures of mazes, paths and success curves."""
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -209,3 +210,44 @@ def _success_line(
     axes.fill_between(x, mean - error, mean + error, color=color, alpha=0.15, linewidth=0)
     axes.set_ylim(-0.02, 1.02)
     axes.grid(alpha=0.25)
+
+
+def interquartile_picture(adaptations: Mapping[str, Mapping[str, Any]]) -> Figure:
+    """Interquartile means and probabilities of improvement by budget, with their intervals.
+
+    Args:
+        adaptations: By name of the adaptation and of the arm its summary, with `robust`.
+    """
+    rows = len(adaptations)
+    figure = Figure(figsize=(11, 3.4 * rows), layout='constrained')
+    panels = figure.subplots(rows, 2, squeeze=False)
+    for row, (name, arms) in zip(panels, adaptations.items(), strict=True):
+        for color, (arm, summary) in zip(cycle(COLORS), arms.items(), strict=False):
+            places = np.arange(len(summary['budgets']))
+            shift = 0.8 / len(arms) * (list(arms).index(arm) - (len(arms) - 1) / 2)
+            for axes, figures in zip(row, ('interquartile_mean', 'improvement'), strict=True):
+                if figures in summary.get('robust', {}):
+                    value, low, high = np.array(summary['robust'][figures]).T
+                    axes.errorbar(
+                        places + shift,
+                        value,
+                        yerr=(value - low, high - value),
+                        color=color,
+                        label=arm,
+                        marker='o',
+                        markersize=4,
+                        linestyle='',
+                    )
+                axes.set_xticks(places, [str(budget) for budget in summary['budgets']])
+                axes.set_xlabel('test-time training steps K')
+                axes.set_ylim(-0.03, 1.03)
+        row[0].set_title(f'{name}: interquartile mean of success')
+        row[1].legend(
+            *row[0].get_legend_handles_labels(),
+            loc='upper left',
+            bbox_to_anchor=(1, 1),
+            frameon=False,
+        )
+        row[1].set_title('probability of improvement over the base')
+        row[1].axhline(0.5, color='grey', linewidth=0.8)
+    return figure

@@ -18,6 +18,7 @@ class Point(BaseModel):
 
     budget: int = Field(ge=0)
     success: float = Field(ge=0, le=1, allow_inf_nan=False)
+    per_task: dict[str, Annotated[float, Field(ge=0, le=1)]] = {}
 
 
 class PolicyResult(BaseModel):

@@ -109,3 +109,14 @@ def _tensorboard(folder: Path, first_step: int) -> SummaryWriter | None:
     from torch.utils.tensorboard import SummaryWriter
 
     return SummaryWriter(str(folder), purge_step=first_step)
+
+
+def last_step(folder: Path) -> int:
+    """The step of the last line that the run in `folder` has logged; 0 before the first."""
+    path = folder / METRICS
+    if not path.exists():
+        return 0
+    with path.open('rb') as file:
+        file.seek(max(0, path.stat().st_size - 2**16))
+        lines = file.read().split(b'\n')[:-1]
+    return int(json.loads(lines[-1])['step']) if lines else 0

@@ -9,10 +9,8 @@ from importlib.metadata import version
 from importlib.util import find_spec
 import os
 from pathlib import Path
-import signal
 import subprocess
 import sys
-import threading
 from typing import Any, ClassVar, TYPE_CHECKING
 
 from filelock import FileLock, Timeout
@@ -24,6 +22,7 @@ from tqdm import tqdm
 from metagcttt_tools.common.cli import fail
 from metagcttt_tools.common.resume import leaves, nested, Resumable
 from metagcttt_tools.common.run_log import RunLog, SilentLog
+from metagcttt_tools.common.stopping import stop_on_signal
 
 if TYPE_CHECKING:
     from metagcttt_core.training.run import TrainingRun
@@ -32,12 +31,26 @@ SNAPSHOTS = 'snapshots'
 _PACKAGES = ('torch', 'numpy', 'mujoco', 'ogbench')
 
 
+def time_limit() -> Any:
+    """The setting of that name."""
+    return Field(
+        None, gt=0, description='seconds after which the run saves and ends, to be queued again'
+    )
+
+
 class RunSettings(Resumable):
     """Settings that the training programs share."""
 
     # The data are known by their content, wherever they are.
     may_change: ClassVar[frozenset[str]] = frozenset(
-        {'dataset', 'checkpoint_every', 'log_every', 'snapshot_every', 'device'}
+        {
+            'dataset',
+            'checkpoint_every',
+            'log_every',
+            'snapshot_every',
+            'device',
+            'time_limit',
+        }
     )
 
     dataset: Path = Field(
@@ -49,6 +62,7 @@ class RunSettings(Resumable):
     log_every: int = Field(100, ge=1, description='steps between log lines')
     threads: int = Field(1, ge=1, description='threads for tensor operations')
     device: str = Field('cpu', description='where to compute: cpu, cuda or cuda:NUMBER')
+    time_limit: float | None = time_limit()
 
     @field_validator('device')
     @classmethod
@@ -97,13 +111,17 @@ def sole_writer(path: Path) -> Iterator[None]:
     Raises:
         SystemExit: With status 2 if another process writes there.
     """
-    lock = path.parent / f'.{path.name}.lock'
-    lock.parent.mkdir(parents=True, exist_ok=True)
     try:
-        with FileLock(lock, timeout=0):
+        with FileLock(lock_of(path), timeout=0):
             yield
     except Timeout:
         fail(f'{path}: another process is writing there; wait for its end or choose another place')
+
+
+def lock_of(path: Path) -> Path:
+    """The file that is locked while something writes to a folder or file of results."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path.parent / f'.{path.name}.lock'
 
 
 @contextmanager
@@ -121,8 +139,9 @@ def training_session(
         steps: Number of steps of the whole run.
 
     Raises:
-        SystemExit: With status 130 after Ctrl-C or SIGTERM, everything done so far being saved;
-            with status 2 when something cannot be written, the last checkpoint being left whole.
+        SystemExit: Everything done so far being saved, with status 130 after Ctrl-C and 75 after
+            SIGTERM, SIGUSR1 or the time limit; with status 2 when something cannot be written, the
+            last checkpoint being left whole.
     """
     from metagcttt_core.meta.parallel import any_process, first_process
     from metagcttt_core.training.run import TrainingInterrupted, TrainingRun
@@ -137,7 +156,9 @@ def training_session(
             first = _steps_to_continue_from(settings, steps)
             if writes:
                 write_settings(settings.out, settings)
-            stop = stack.enter_context(stop_on_signal())
+                if first:
+                    print(f'continues after step {first}')
+            stop = stack.enter_context(stop_on_signal(settings.time_limit))
             log = stack.enter_context(RunLog(settings.out, first) if writes else SilentLog())
             bar = stack.enter_context(
                 tqdm(total=steps, initial=first, unit='step', desc=stage, disable=not writes)
@@ -155,7 +176,7 @@ def training_session(
     except TrainingInterrupted as interruption:
         if writes:
             print(f'{interruption}; pass --resume to continue')
-        raise SystemExit(130) from interruption
+        raise SystemExit(stop.status) from interruption
     except OSError as error:
         fail(f'{settings.out}: cannot be written ({error}); {left_behind(settings)}')
     if writes:
@@ -193,34 +214,25 @@ def process_group(device: str) -> Iterator[None]:
     """Connects the processes that `torchrun` started; without it there is nothing to connect."""
     import torch
     from torch import distributed
+    from torch.distributed.distributed_c10d import PrefixStore
+    from torch.distributed.rendezvous import rendezvous
 
     if not distributed.is_torchelastic_launched():
         yield
         return
     if device == 'cuda':
         torch.cuda.set_device(int(os.environ['LOCAL_RANK']))
-    distributed.init_process_group('gloo' if device == 'cpu' else 'nccl')
+    store, rank, size = next(iter(rendezvous('env://')))
+    if os.environ['LOCAL_WORLD_SIZE'] == os.environ['WORLD_SIZE']:
+        # torchrun's store keeps the addresses of killed processes (pytorch #135712); between
+        # machines the count of restarts differs.
+        store = PrefixStore(os.environ['TORCHELASTIC_RESTART_COUNT'], store)
+    backend = 'gloo' if device == 'cpu' else 'nccl'
+    distributed.init_process_group(backend, store=store, rank=rank, world_size=size)
     try:
         yield
     finally:
         distributed.destroy_process_group()
-
-
-@contextmanager
-def stop_on_signal() -> Iterator[threading.Event]:
-    """An event that Ctrl-C or SIGTERM sets, so that a run can save before it ends."""
-    stop = threading.Event()
-
-    def request(signum: int, frame: object) -> None:
-        stop.set()
-
-    signals = (signal.SIGINT, signal.SIGTERM)
-    previous = {number: signal.signal(number, request) for number in signals}
-    try:
-        yield stop
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 def history_entry(stage: str, settings: RunSettings, decisive: dict[str, Any]) -> dict[str, Any]:

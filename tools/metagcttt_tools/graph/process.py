@@ -18,7 +18,7 @@ class NodeFailedError(RuntimeError):
 
 
 class NodeProcess:
-    """One executable of the `metagcttt` package, its output kept in a log file."""
+    """One ROS executable, its output kept in a log file."""
 
     def __init__(
         self,
@@ -27,6 +27,7 @@ class NodeProcess:
         log: Path,
         environment: Mapping[str, str] | None = None,
         remappings: Mapping[str, str] | None = None,
+        package: str = 'metagcttt',
     ) -> None:
         """Start it.
 
@@ -36,10 +37,11 @@ class NodeProcess:
             log: File for what it prints.
             environment: Environment variables besides those of this process.
             remappings: Names to replace, such as `/clock`; `__ns` sets the namespace.
+            package: The ROS package that has it.
         """
         self.executable = executable
         self.log = log
-        command = [*_ENDS_WITH_ITS_OWNER, str(_ROS2RUN), 'metagcttt', executable, '--ros-args']
+        command = [*_ENDS_WITH_ITS_OWNER, str(_ROS2RUN), package, executable, '--ros-args']
         for name, value in parameters.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             command += ['-p', f'{name}:={text}']

@@ -1,10 +1,10 @@
 """Trajectories from recordings of deployed robots, so that what they do becomes data."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.data.errors import DatasetError
@@ -135,8 +135,14 @@ def _trajectories(
     return robot.trajectories
 
 
-def join_datasets(datasets: Iterable[TrajectoryDataset]) -> TrajectoryDataset:
+def join_datasets(
+    datasets: Iterable[TrajectoryDataset], *, contract: Mapping[str, Any] | None = None
+) -> TrajectoryDataset:
     """All trajectories of several datasets, without their extras.
+
+    Args:
+        datasets: The datasets.
+        contract: Identity of the contract that all of them satisfy, if any.
 
     Raises:
         DatasetError: If observations or actions differ in length.
@@ -144,14 +150,17 @@ def join_datasets(datasets: Iterable[TrajectoryDataset]) -> TrajectoryDataset:
     datasets = list(datasets)
     return _join(
         [
-            (dataset.observations[start : end + 1], dataset.actions[start : end + 1])
+            (dataset.states(slice(start, end + 1)), dataset.actions[start : end + 1])
             for dataset in datasets
             for start, end in zip(dataset.episode_starts, dataset.episode_ends, strict=True)
-        ]
+        ],
+        contract,
     )
 
 
-def _join(trajectories: list[tuple[np.ndarray, np.ndarray]]) -> TrajectoryDataset:
+def _join(
+    trajectories: list[tuple[np.ndarray, np.ndarray]], contract: Mapping[str, Any] | None = None
+) -> TrajectoryDataset:
     sizes = sorted({(o.shape[1], a.shape[1]) for o, a in trajectories})
     if len(sizes) > 1:
         raise DatasetError(
@@ -163,6 +172,7 @@ def _join(trajectories: list[tuple[np.ndarray, np.ndarray]]) -> TrajectoryDatase
         np.concatenate([o for o, _ in trajectories]),
         np.concatenate([a for _, a in trajectories]),
         np.concatenate(terminals),
+        contract=contract,
     )
 
 

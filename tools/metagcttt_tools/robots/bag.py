@@ -1,5 +1,6 @@
 """Bags as recorded by ROS: folders, .mcap, .db3, split or compressed. No ROS."""
 
+from bisect import bisect_right
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +14,8 @@ from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
 from metagcttt_tools.common.bags import open_any_bag, reading
+
+CLOCK = '/clock'
 
 
 class Recorded(NamedTuple):
@@ -61,14 +64,42 @@ class Bag:
         self.definitions = Definitions(reader.typestore)
 
     def messages(self) -> Iterator[Recorded]:
-        """The messages of the contract's topics in the order of reception."""
+        """The messages of the contract's topics in the order of reception.
+
+        In a bag with `/clock` the time of reception is the simulated one: between two messages of
+        the clock in proportion to the recorded time. What came before the first is left out.
+        """
         connections = [connection for _, connection in self._connections.values()]
         if not connections:
             return
         with reading(self._path):
+            clock = self._clock()
             for connection, received_ns, data in self._reader.messages(connections):
+                if clock:
+                    if received_ns < clock[0][0]:
+                        continue
+                    received_ns = _simulated(clock, received_ns)
                 message = self._reader.deserialize(data, connection.msgtype)
                 yield Recorded(self._names[connection.topic], message, received_ns)
+
+    def _clock(self) -> list[tuple[int, int]]:
+        """Recorded and simulated times of `/clock`, nanoseconds; empty without it."""
+        clocks = [c for c in self._reader.connections if c.topic == CLOCK]
+        times = []
+        for connection, recorded_ns, data in self._reader.messages(clocks) if clocks else ():
+            message: Any = self._reader.deserialize(data, connection.msgtype)
+            times.append((recorded_ns, message.clock.sec * 10**9 + message.clock.nanosec))
+        return times
+
+
+def _simulated(clock: list[tuple[int, int]], recorded_ns: int) -> int:
+    """The simulated time of a recorded one, by the messages of the clock around it."""
+    after = bisect_right(clock, recorded_ns, key=lambda times: times[0])
+    recorded, simulated = clock[after - 1]
+    if after == len(clock):
+        return simulated
+    share = (recorded_ns - recorded) / (clock[after][0] - recorded)
+    return simulated + round(share * (clock[after][1] - simulated))
 
 
 def resolved(topic: str, namespace: str) -> str:

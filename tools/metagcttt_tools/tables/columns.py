@@ -145,7 +145,7 @@ def map_of_contract(
             CommandColumn(**_place(name, commanded_in), low=low, high=high)
             for name, (low, high) in zip(commanded_names(contract), limits, strict=True)
         ),
-        position=contract.position or (),
+        position=tuple(contract.columns[dim] for dim in contract.position_dims),
     )
 
 

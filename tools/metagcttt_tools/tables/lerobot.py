@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-import json
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
 
 from metagcttt_core.config import error_lines
 from metagcttt_core.data import DatasetError
+from metagcttt_core.files import read_json
 import numpy as np
 from numpy.typing import NDArray
 import pyarrow as pa
@@ -122,19 +122,19 @@ def read_lerobot(
 def _read_info(folder: Path) -> Info:
     path = folder / 'meta' / 'info.json'
     try:
-        values = json.loads(path.read_text('utf-8'))
+        values = read_json(path)
     except FileNotFoundError as error:
         raise DatasetError(f'{folder}: no LeRobot dataset there, expected {path}') from error
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise DatasetError(f'{path}: cannot be read ({error})') from error
-    version = str(values.get('codebase_version')) if isinstance(values, Mapping) else ''
+    version = str(values.get('codebase_version'))
     if not version.startswith('v3.'):
         hint = (
             '; python -m lerobot.datasets.v30.convert_dataset_v21_to_v30 of LeRobot converts it'
             if version.startswith('v2.')
             else ''
         )
-        raise DatasetError(f'{path}: codebase_version is {version or "missing"}, not v3{hint}')
+        raise DatasetError(f'{path}: codebase_version is {version}, not v3{hint}')
     try:
         return Info.model_validate(values)
     except ValidationError as error:

@@ -49,7 +49,7 @@ def write_lerobot(
     lengths = dataset.episode_ends - dataset.episode_starts + 1
     frames = np.arange(dataset.num_rows) - np.repeat(dataset.episode_starts, lengths)
     columns = {
-        STATE: np.asarray(dataset.observations),
+        STATE: np.asarray(dataset.states(slice(None))),
         ACTION: actions.astype(np.float32),
         'next.done': np.asarray(dataset.terminals),
         'timestamp': (frames / fps).astype(np.float32),

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from metagcttt_core.data import DatasetError, TrajectoryDataset
+from metagcttt_core.data.inspection import TIME
 import numpy as np
 from numpy.typing import NDArray
 import pyarrow as pa
@@ -12,9 +13,6 @@ import pyarrow.compute as pc
 
 from metagcttt_tools.tables.columns import ColumnMap, CommandColumn, ObservedColumn
 from metagcttt_tools.tables.files import numbers, read_csv, read_parquet
-
-TIME = 'time_s'
-"""The extra of a dataset with the times of its rows, seconds, by which rates are known."""
 
 Names = Mapping[str, Sequence[str]]
 """The names of the values in columns of lists."""

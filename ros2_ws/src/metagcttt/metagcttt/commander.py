@@ -1,8 +1,9 @@
 """Client for programs: drives a robot with blocking or non-blocking calls."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+import math
 import time
 from typing import Any
 import uuid
@@ -103,7 +104,12 @@ class RobotCommander(Node):
     # --- goals -------------------------------------------------------------------------------
 
     def reach(
-        self, goal: ArrayLike, *, max_steps: int = 0, timeout_s: float = 60.0
+        self,
+        goal: ArrayLike | Mapping[str, float],
+        *,
+        max_steps: int = 0,
+        timeout_s: float = 60.0,
+        **how: Any,
     ) -> ReachResult:
         """Drive to a goal and wait for the result.
 
@@ -111,12 +117,13 @@ class RobotCommander(Node):
             goal: See `send`.
             max_steps: See `send`.
             timeout_s: Longest wait, seconds, after which the goal is canceled.
+            how: `yaw`, `tolerances` and `max_s` of `send`.
 
         Raises:
             NoAnswerError: If it takes longer.
             GoalLostError: If the goal node becomes silent.
         """
-        sent = self.send(goal, max_steps=max_steps, timeout_s=timeout_s)
+        sent = self.send(goal, max_steps=max_steps, timeout_s=timeout_s, **how)
         try:
             return sent.result(timeout_s)
         except GoalLostError:
@@ -125,28 +132,47 @@ class RobotCommander(Node):
             sent.cancel()
             raise
 
-    def send(self, goal: ArrayLike, *, max_steps: int = 0, timeout_s: float = 10.0) -> 'SentGoal':
+    def send(
+        self,
+        goal: ArrayLike | Mapping[str, float],
+        *,
+        yaw: float = 0.0,
+        tolerances: Mapping[str, float] | None = None,
+        max_steps: int = 0,
+        max_s: float = 0.0,
+        timeout_s: float = 10.0,
+    ) -> 'SentGoal':
         """Send a goal and return when the goal node has accepted or rejected it.
 
         Args:
-            goal: Position (x, y) in metres, or a full goal observation, shape (obs_dim,).
+            goal: Position (x, y) in metres, a full goal observation, shape (obs_dim,), or values
+                of a robot by the names of its contract, such as `{'elbow_joint.position': 1.2}`.
+            yaw: With a position: orientation, rad; it counts where the contract says so.
+            tolerances: With named values: largest deviation of each; by default the contract's.
             max_steps: Control steps that it may take; 0 for the goal node's own limit.
+            max_s: Seconds that it may take; 0 for the contract's limit.
             timeout_s: Longest wait for the answer, seconds.
 
         Raises:
             NoAnswerError: If there is no answer.
         """
-        values = to_floats(goal)
         request = ReachGoal.Goal(
             max_steps=max_steps,
+            timeout_s=float(max_s),
             episode_id=self._episode_id,
             world_id=self._world_id,
             request_id=uuid.uuid4().hex,
         )
         request.pose = PoseStamped()
         request.pose.header.frame_id = self._frame_id
-        request.pose.pose.orientation.w = 1.0
-        if len(values) == 2:
+        request.pose.pose.orientation.z = math.sin(yaw / 2)
+        request.pose.pose.orientation.w = math.cos(yaw / 2)
+        if isinstance(goal, Mapping):
+            request.named.names = list(goal)
+            request.named.values = to_floats(list(goal.values()))
+            if tolerances is not None:
+                request.named.tolerances = to_floats([tolerances[name] for name in goal])
+        elif len(values := to_floats(goal)) == 2:
             request.pose.pose.position = to_point(values)
         else:
             request.goal = values

@@ -53,6 +53,7 @@ def state_message(
     truncated: bool,
     success: bool,
     world_id: int = 0,
+    contract: str = '',
 ) -> MazeState:
     """The state after a control step."""
     return MazeState(
@@ -65,6 +66,7 @@ def state_message(
         truncated=bool(truncated),
         success=bool(success),
         world_id=world_id,
+        contract=contract,
     )
 
 
@@ -78,6 +80,7 @@ def action_message(
     adapted: bool,
     instance: int = 0,
     world_id: int = 0,
+    withheld: bool = False,
 ) -> ActionCommand:
     """The action for a state."""
     return ActionCommand(
@@ -89,6 +92,7 @@ def action_message(
         adapted=bool(adapted),
         instance=instance,
         world_id=world_id,
+        withheld=withheld,
     )
 
 

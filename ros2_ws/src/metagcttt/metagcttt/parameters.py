@@ -20,6 +20,12 @@ CHECKPOINT = Parameter('checkpoint', '', 'folder of the policy; empty: the commi
 DATASET = Parameter('dataset', '', 'dataset file (.npz); empty: the committed one')
 
 GOAL_NODE = (
+    Parameter(
+        'contract',
+        '',
+        "a robot's contract (YAML), whose frame, tolerances, time and map decide about goals "
+        'instead of those of `environment`; empty: a maze',
+    ),
     ENVIRONMENT,
     DATASET,
     STEPPING,
@@ -195,9 +201,10 @@ POLICY_NODE = (
     ),
     Parameter(
         'epsilon',
-        1.0,
-        'distance within which a trajectory has to pass the robot to be relevant, metres',
-        (0.001, 1000),
+        0.0,
+        'distance within which a trajectory has to pass the robot to be relevant, metres; 0: that '
+        "of the robot's contract, or 1",
+        (0, 1000),
         changes='configure',
     ),
     Parameter(

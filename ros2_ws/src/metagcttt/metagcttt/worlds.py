@@ -28,7 +28,9 @@ class WorldOrder:
     In a world, time does not run backwards: what is older than the newest state is refused.
     Another world replaces the present one unless it was published before it. A source without
     identity shows only by older numbers that it has begun again, which stray states have too. So
-    they count as another world once `restart_states` of them follow one another.
+    they count as another world once `restart_states` of them follow one another. So do, once there
+    are `RESTART_STATES`, those of a world whose clock is behind that of the one before it, on
+    another computer or set back, where only late messages would be expected.
 
     Attributes:
         now: The newest moment; None before the first.
@@ -53,15 +55,15 @@ class WorldOrder:
             published_ns: Time of its publication, nanoseconds.
         """
         if self.now is None or state.world_id != self.now.world_id:
-            return self._enter_other(state, published_ns)
+            refusal = self._enter_other(state, published_ns)
+            if not refusal or self._follows(state, may_repeat=True) < RESTART_STATES:
+                return refusal
+            return self._enter(state, published_ns)
         if state >= self.now:
             return self._go_to(state, published_ns)
         if state.world_id or published_ns < self._published_ns:
             return self._refusal(state)
-        follows = self._older is not None and state > self._older
-        self._num_older = self._num_older + 1 if follows else 1
-        self._older = state
-        if self._num_older < self._restart_states:
+        if self._follows(state) < self._restart_states:
             return self._refusal(state)
         return self._enter(state, published_ns)
 
@@ -88,6 +90,15 @@ class WorldOrder:
         self._has_started |= not refusal
         return refusal
 
+    def _follows(self, state: Moment, *, may_repeat: bool = False) -> int:
+        """The number of states outside the present, up to this one, that follow one another."""
+        older, self._older = self._older, state
+        same = older is not None and older.world_id == state.world_id
+        if older is None or not same or state < older or (state == older and not may_repeat):
+            self._num_older = 0
+        self._num_older += 1
+        return self._num_older
+
     def _begins_again(self, published_ns: int) -> bool:
         """True for the start of the present episode by a source without identity, after steps."""
         assert self.now is not None
@@ -101,6 +112,7 @@ class WorldOrder:
     def _enter(self, moment: Moment, published_ns: int) -> str:
         self.num_worlds += 1
         self._has_started = False
+        self._published_ns = published_ns
         return self._go_to(moment, published_ns)
 
     def _go_to(self, moment: Moment, published_ns: int) -> str:

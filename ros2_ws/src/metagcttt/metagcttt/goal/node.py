@@ -1,26 +1,34 @@
 """The goal node."""
 
 from collections.abc import Iterable
+from functools import partial
+from pathlib import Path
 import time
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 from metagcttt_core import TrajectoryDataset, TrajectoryFilter
 from metagcttt_core.config.assets import dataset_path
+from metagcttt_core.robot import Contract, load_contract
+from metagcttt_core.robot.contract import GoalMap
 from metagcttt_interfaces.action import ReachGoal
-from metagcttt_interfaces.msg import EpisodeEvent, MazeState, PolicyStatus
+from metagcttt_interfaces.msg import EpisodeEvent, MazeState, NamedGoal, PolicyStatus
+from nav_msgs.msg import OccupancyGrid
 import numpy as np
-from rclpy.node import Node
 from sim_bridge import describe_environment
 
 from metagcttt.clocks import JumpFreeClock, STEADY
+from metagcttt.conventions import ConventionalNode
 from metagcttt.converters import to_array
 from metagcttt.diagnostics import Diagnostics
-from metagcttt.goal.goals import GoalCatalog, RobotState, Verdict
+from metagcttt.goal.goals import Catalog, GoalCatalog, RobotState
 from metagcttt.goal.health import GoalMonitor
+from metagcttt.goal.obstacles import Obstacles
 from metagcttt.goal.publishers import GoalPublishers
 from metagcttt.goal.reach_goal_server import feedback_message, ReachGoalServer
+from metagcttt.goal.robot_goals import RobotGoals
 from metagcttt.goal.tracker import Change, Ended, GoalRequest, GoalTracker, Ignored, Now, Rejected
+from metagcttt.goal.verdict import Verdict
 from metagcttt.health import Health
 from metagcttt.input_checks import vector_fault
 from metagcttt.parameter_set import ParameterSet
@@ -38,7 +46,7 @@ from metagcttt.worlds import Moment
 WATCHDOG_PERIOD_S = 0.1
 
 
-class GoalNode(Node):
+class GoalNode(ConventionalNode):
     """Puts poses, action goals and task goals in force, as `GoalTracker` decides."""
 
     def __init__(self, **kwargs: Any) -> None:
@@ -53,20 +61,21 @@ class GoalNode(Node):
         """
         super().__init__('goal_node', **kwargs)
         self._settings = ParameterSet(self, GOAL_NODE, is_configured=lambda: True)
-        description = describe_environment(self._settings['environment'])
-        self._spec = description.spec
+        self._robot: Contract | None = None
+        if self._settings['contract']:
+            self._robot = load_contract(Path(self._settings['contract']).expanduser())
         self._clock_without_jumps = JumpFreeClock(self)
         dataset = TrajectoryDataset.load(dataset_path(self._settings['dataset']))
+        catalog = self._catalog(dataset)
         self._tracker = GoalTracker(
-            GoalCatalog(description, TrajectoryFilter(dataset)),
-            self._settings['frame_id'],
+            catalog,
             self._now(),
             realtime=self._settings['stepping'] == 'realtime',
         )
         self._monitor = GoalMonitor()
         self._policy = PolicyStatus()
 
-        self._goal_publishers = GoalPublishers(self, self._settings['frame_id'])
+        self._goal_publishers = GoalPublishers(self, catalog.frame_id)
         profile = state_profile(self._settings['stepping'])
         if self._settings['stepping'] == 'lockstep':
             # The simulator waits for the policy, not for this node, which must see every step.
@@ -74,14 +83,15 @@ class GoalNode(Node):
         self.create_subscription(
             MazeState,
             'state',
-            self._on_state,  # type: ignore[arg-type] # rclpy gives it the info as well
+            self._on_state,
             profile,
         )
         self.create_subscription(PoseStamped, 'goal_pose', self._on_goal_pose, COMMAND)
+        self.create_subscription(NamedGoal, 'goal_values', self._on_goal_values, COMMAND)
         self.create_subscription(
             EpisodeEvent,
             'episode',
-            self._on_event,  # type: ignore[arg-type] # here too
+            self._on_event,
             EVENTS,
         )
         self.create_subscription(PolicyStatus, 'policy_status', self._on_policy, LATCHED)
@@ -97,7 +107,37 @@ class GoalNode(Node):
         self._diagnostics = Diagnostics(
             self, self._examine, self._settings['diagnostics_period_s']
         )
-        self.get_logger().info(f'goals in {self._spec.name}, completed from {dataset.source}')
+        self.get_logger().info(f'goals in {self._what}, completed from {dataset.source}')
+
+    def _catalog(self, dataset: TrajectoryDataset) -> Catalog:
+        """What decides about goals: a robot's contract, or a maze."""
+        if self._robot is None:
+            description = describe_environment(self._settings['environment'])
+            spec = description.spec
+            self._what, self._obs_dim, self._fingerprint = spec.name, spec.obs_dim, ''
+            self._tolerance_m, self._max_steps = spec.goal_tolerance_m, spec.max_episode_steps
+            frame_id = self._settings['frame_id']
+            return GoalCatalog(description, TrajectoryFilter(dataset), frame_id)
+        goals = RobotGoals(self._robot, dataset)
+        self._what, self._obs_dim = f'the frame {goals.frame_id!r}', self._robot.obs_dim
+        self._fingerprint = self._robot.identity['fingerprint']
+        self._tolerance_m, self._max_steps = 0.0, 0  # the contract's tolerances and time
+        section = self._robot.goal
+        if section is not None and section.map is not None:
+            self.create_subscription(
+                OccupancyGrid,
+                section.map.topic,
+                partial(self._on_map, goals, section.map),
+                LATCHED,
+            )
+        return goals
+
+    def _on_map(self, goals: RobotGoals, settings: GoalMap, message: OccupancyGrid) -> None:
+        try:
+            goals.obstacles = Obstacles.of(message, settings)
+        except ValueError as error:
+            self._monitor.ignored(str(error))
+            self.get_logger().error(f'the map is ignored: {error}')
 
     def end_service(self) -> None:
         """End the goal in force before the node shuts down."""
@@ -112,10 +152,15 @@ class GoalNode(Node):
     # --- input -------------------------------------------------------------------------------
 
     def _to_request(self, message: ReachGoal.Goal) -> GoalRequest:
-        point = message.pose.pose.position
+        point, turn = message.pose.pose.position, message.pose.pose.orientation
         return GoalRequest(
             seed=self._settings['seed'],
             xy=(point.x, point.y),
+            quaternion=(turn.x, turn.y, turn.z, turn.w),
+            names=tuple(message.named.names),
+            values=tuple(message.named.values),
+            tolerances=tuple(message.named.tolerances),
+            timeout_s=message.timeout_s,
             frame_id=message.pose.header.frame_id,
             observation=to_array(message.goal) if message.goal else None,
             episode_id=message.episode_id,
@@ -136,6 +181,14 @@ class GoalNode(Node):
         request = self._to_request(ReachGoal.Goal(pose=message))
         self._publish(self._tracker.request(request, self._now()))
 
+    def _on_goal_values(self, message: NamedGoal) -> None:
+        request = self._to_request(ReachGoal.Goal(named=message))
+        if not request.names:
+            refusal = Verdict('WRONG_SIZE', 'a goal by named values without names')
+            self._publish([self._tracker.reject(request, refusal)])
+            return
+        self._publish(self._tracker.request(request, self._now()))
+
     def _on_event(self, message: EpisodeEvent, info: dict[str, int]) -> None:
         if message.kind != EpisodeEvent.STARTED:
             return
@@ -154,9 +207,11 @@ class GoalNode(Node):
 
     def _on_state(self, message: MazeState, info: dict[str, int]) -> None:
         xy = (message.position.x, message.position.y)
-        fault = vector_fault(
-            'the state', to_array(message.observation), self._spec.obs_dim
-        ) or vector_fault("the state's position", np.array(xy), 2)
+        observation = to_array(message.observation)
+        fault = self._contract_fault(message.contract) or (
+            vector_fault('the state', observation, self._obs_dim)
+            or vector_fault("the state's position", np.array(xy), 2)
+        )
         self._monitor.saw_state(fault)
         if fault:
             return
@@ -167,17 +222,24 @@ class GoalNode(Node):
             ended=message.terminated or message.truncated,
             success=message.success,
             world_id=message.world_id,
+            observation=observation,
         )
         self._publish(
             self._tracker.on_state(
                 state,
                 info['source_timestamp'],
                 self._now(),
-                tolerance_m=self._settings['goal_tolerance_m'] or self._spec.goal_tolerance_m,
-                max_steps=self._settings['max_steps'] or self._spec.max_episode_steps,
+                tolerance_m=self._settings['goal_tolerance_m'] or self._tolerance_m,
+                max_steps=self._settings['max_steps'] or self._max_steps,
             )
         )
         self._send_feedback()
+
+    def _contract_fault(self, fingerprint: str) -> str:
+        """Why a state of that contract is none of this robot; empty if it is."""
+        if not fingerprint or not self._fingerprint or fingerprint == self._fingerprint:
+            return ''
+        return f'the state is of contract {fingerprint}, goals are of {self._fingerprint}'
 
     def _on_policy(self, message: PolicyStatus) -> None:
         self._policy = message

@@ -1,5 +1,6 @@
 """Publishers of the goal node, and its log of goals."""
 
+import math
 import time
 
 from metagcttt_interfaces.action import ReachGoal
@@ -8,7 +9,7 @@ from rclpy.node import Node
 from std_msgs.msg import Header
 
 from metagcttt.converters import goal_message, to_point
-from metagcttt.goal.goals import AcceptedGoal, Verdict
+from metagcttt.goal.goals import AcceptedGoal
 from metagcttt.goal.tracker import (
     Accepted,
     Change,
@@ -17,6 +18,7 @@ from metagcttt.goal.tracker import (
     MAX_REQUEST_ID,
     Rejected,
 )
+from metagcttt.goal.verdict import Verdict
 from metagcttt.goal_in_force import Goal
 from metagcttt.qos import EVENTS, LATCHED
 
@@ -100,7 +102,8 @@ class GoalPublishers:
             )
         )
         reason = f': {verdict.reason}' if verdict.reason else ''
-        self._node.get_logger().info(f'{name} at ({x:.2f}, {y:.2f}) {what}{reason}')
+        place = '' if math.isnan(x) else f' at ({x:.2f}, {y:.2f})'  # a robot without a position
+        self._node.get_logger().info(f'{name}{place} {what}{reason}')
 
     def _header(self) -> Header:
         return Header(stamp=self._node.get_clock().now().to_msg(), frame_id=self._frame_id)

@@ -10,8 +10,9 @@ from rclpy.action import ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
-from metagcttt.goal.goals import AcceptedGoal, RobotState, Verdict
+from metagcttt.goal.goals import AcceptedGoal, RobotState
 from metagcttt.goal.tracker import Ended
+from metagcttt.goal.verdict import Verdict
 
 FEEDBACK_PERIOD_S = 0.1
 
@@ -28,7 +29,7 @@ def feedback_message(
     """
     feedback = ReachGoal.Feedback(phase=ReachGoal.Feedback.WAITING, distance_m=math.nan)
     if state is not None:
-        feedback.distance_m = math.dist(state.xy, goal.xy)
+        feedback.distance_m = math.dist(state.xy, goal.xy)  # NaN for a robot without a position
         feedback.steps = max(state.step - goal.first_step, 0)
     if policy.query_id == goal.query_id:
         feedback.phase = {

@@ -1,12 +1,14 @@
 """The life of goals: requests are accepted or rejected, and a goal in force ends."""
 
 from dataclasses import dataclass
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from metagcttt.goal.goals import AcceptedGoal, goal_ending, GoalCatalog, RobotState, Verdict
+from metagcttt.goal.goals import AcceptedGoal, Catalog, goal_ending, RobotState
+from metagcttt.goal.verdict import Verdict
 from metagcttt.worlds import Moment, RESTART_STATES, WorldOrder
 
 MAX_REQUEST_ID = 256
@@ -33,6 +35,11 @@ class GoalRequest:
         max_steps: Control steps that it may take; 0: the goal node's own limit.
         request_id: Name that the sender gave it.
         world_id: The only world in which it counts, awaited if need be; 0: the newest.
+        quaternion: Orientation at the goal: x, y, z, w.
+        names: Observed values of a robot that it fixes by name, which replace the position.
+        values: One for each name.
+        tolerances: One for each name, or none.
+        timeout_s: Time that it may take, seconds; 0: the catalog's.
     """
 
     seed: int
@@ -44,6 +51,11 @@ class GoalRequest:
     max_steps: int = 0
     request_id: str = ''
     world_id: int = 0
+    quaternion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    names: tuple[str, ...] = ()
+    values: tuple[float, ...] = ()
+    tolerances: tuple[float, ...] = ()
+    timeout_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -93,20 +105,16 @@ class GoalTracker:
         goal: The goal in force; None when there is none.
     """
 
-    def __init__(
-        self, catalog: GoalCatalog, frame_id: str, now: Now, *, realtime: bool = False
-    ) -> None:
+    def __init__(self, catalog: Catalog, now: Now, *, realtime: bool = False) -> None:
         """Start without an episode.
 
         Args:
             catalog: Checks and completes goals.
-            frame_id: Frame of all positions.
             now: The current time.
             realtime: Whether states that are late are faults, and may be out of order.
         """
         self.goal: AcceptedGoal | None = None
         self._catalog = catalog
-        self._frame_id = frame_id
         self._realtime = realtime
         # In lockstep, states are delivered in order, and one that begins again has no successor.
         self._order = WorldOrder(RESTART_STATES if realtime else 1)
@@ -135,14 +143,12 @@ class GoalTracker:
         if len(request.request_id) > MAX_REQUEST_ID:
             reason = f'request_id is longer than {MAX_REQUEST_ID} characters'
             return Verdict('WRONG_SIZE', reason)
-        if request.observation is None and request.frame_id != self._frame_id:
-            reason = f'the goal is in frame {request.frame_id!r}, goals are in {self._frame_id!r}'
-            return Verdict('WRONG_FRAME', reason)
+        if not (math.isfinite(request.timeout_s) and request.timeout_s >= 0):
+            return Verdict('NOT_FINITE', f'a time limit of {request.timeout_s} s is none')
         if refusal := self._episode_refusal(request):
             return refusal
-        if request.observation is not None:
-            return self._catalog.observation_refusal(request.observation)
-        return self._catalog.refusal(*request.xy)
+        resolved = self._catalog.resolve(request)
+        return resolved if isinstance(resolved, Verdict) else None
 
     def _episode_refusal(self, request: GoalRequest) -> Verdict | None:
         present = self._order.now
@@ -177,14 +183,15 @@ class GoalTracker:
         world_id = request.world_id or present.world_id
         episode_id = request.episode_id or present.episode_id
         self._is_awaited = (world_id, episode_id) != present[:2]
-        observation = request.observation
-        if observation is None:
-            observation = self._catalog.complete(*request.xy)
+        resolved = self._catalog.resolve(request)
+        assert not isinstance(resolved, Verdict), 'the caller looked'
         self.goal = AcceptedGoal(
             query_id=number,
             episode_id=episode_id,
-            observation=observation,
-            xy=self._catalog.position(observation),
+            observation=resolved.observation,
+            xy=resolved.xy,
+            terms=resolved.terms,
+            timeout_s=request.timeout_s or resolved.timeout_s,
             seed=request.seed,
             world_id=world_id,
             first_step=0 if self.state is None or request.is_task else self.state.step,
@@ -230,7 +237,13 @@ class GoalTracker:
         self._seen = now
         if self.goal is not None:
             self._goal_step = max(self._goal_step, state.step)
-            ending = goal_ending(self.goal, state, tolerance_m=tolerance_m, max_steps=max_steps)
+            ending = goal_ending(
+                self.goal,
+                state,
+                tolerance_m=tolerance_m,
+                max_steps=max_steps,
+                seconds=now.clock_s - self.goal.accepted_s,
+            )
             if ending is not None:
                 changes += self.end(ending, now)
         return changes

@@ -1,7 +1,8 @@
 """A base policy with the dataset it adapts on, and its adaptation to a goal."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from metagcttt_core import (
     adapt,
@@ -14,10 +15,11 @@ from metagcttt_core import (
     TTTConfig,
 )
 from metagcttt_core.adaptation import AdaptationCancelled, OnStep
-from metagcttt_core.adaptation.config import EngineName
 from metagcttt_core.adaptation.inner_loop import run_inner_loop
 from metagcttt_core.config.assets import checkpoint_path, dataset_path
 from metagcttt_core.retrieval.value_cache import ValueFunction
+from metagcttt_core.robot import identity_fault
+from metagcttt_core.training.config import EngineName
 from metagcttt_core.training.optimizers import pretrained_state
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +33,16 @@ class Deployment:
 
     agent: Agent
     trajectory_filter: TrajectoryFilter
+
+    @property
+    def contract(self) -> Mapping[str, Any] | None:
+        """The identity of the robot's contract that they were made for, if any."""
+        return self.agent.metadata.get('contract') or self.dataset.contract
+
+    def contract_fault(self, fingerprint: str) -> str:
+        """Why a state of the contract with that fingerprint is none for them; empty if it is."""
+        met = {'robot': 'the robot of the state', 'fingerprint': fingerprint}
+        return identity_fault('the policy', self.contract, met if fingerprint else None)
 
     @property
     def dataset(self) -> TrajectoryDataset:
@@ -71,13 +83,16 @@ class _CancellableValue:
         return self.value_fn(observations, goal)
 
 
-def load_deployment(checkpoint: str, dataset: str, config: FilterConfig) -> Deployment:
+def load_deployment(
+    checkpoint: str, dataset: str, config: FilterConfig, *, epsilon_of_contract: bool = False
+) -> Deployment:
     """Load a policy, and load and index its dataset.
 
     Args:
         checkpoint: Folder of the checkpoint; empty for the committed one.
         dataset: File of the dataset; empty for the committed one.
-        config: Selection of sub-trajectories.
+        config: Selection of sub-trajectories; a robot's contract decides about the position.
+        epsilon_of_contract: Whether it also decides about epsilon, if it names one.
 
     Raises:
         FileNotFoundError: If the committed assets are asked for and missing.
@@ -92,7 +107,15 @@ def load_deployment(checkpoint: str, dataset: str, config: FilterConfig) -> Depl
             f'actions of {agent.act_dim} values, the dataset {dataset_file} has {data.obs_dim} '
             f'and {data.act_dim}'
         )
-    return Deployment(agent, TrajectoryFilter(data, config))
+    made_for = agent.metadata.get('contract')
+    if fault := identity_fault(f'the dataset {dataset_file}', data.contract, made_for):
+        raise ValueError(f'{fault}, as the checkpoint {checkpoint_folder} is')
+    contract = made_for or data.contract or {}
+    changes = {'position_dims': contract.get('position_dims')}
+    if epsilon_of_contract:
+        changes['epsilon'] = contract.get('epsilon')
+    given = {name: value for name, value in changes.items() if value}
+    return Deployment(agent, TrajectoryFilter(data, FilterConfig(**config.model_dump() | given)))
 
 
 def warm_up(deployment: Deployment, config: TTTConfig) -> str:

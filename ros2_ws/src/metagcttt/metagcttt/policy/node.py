@@ -11,6 +11,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool
 import torch
 
+from metagcttt.conventions import ConventionalNode
 from metagcttt.diagnostics import Diagnostics
 from metagcttt.health import Health, Level
 from metagcttt.parameter_set import ParameterSet
@@ -19,7 +20,7 @@ from metagcttt.policy.deployment import load_deployment, warm_up
 from metagcttt.policy.session import inner_loop, PolicySession
 
 
-class PolicyNode(LifecycleNode):
+class PolicyNode(ConventionalNode, LifecycleNode):
     """Loads a policy and its dataset when configured, and acts on goals while active."""
 
     def __init__(self, **kwargs: Any) -> None:
@@ -66,12 +67,15 @@ class PolicyNode(LifecycleNode):
         """Load policy and dataset, and connect; a failure leaves the node unconfigured."""
         config = FilterConfig(
             variant=self._settings['filter_variant'],
-            epsilon=self._settings['epsilon'],
+            epsilon=self._settings['epsilon'] or 1.0,
             top_percent=self._settings['top_percent'],
         )
         try:
             deployment = load_deployment(
-                self._settings['checkpoint'], self._settings['dataset'], config
+                self._settings['checkpoint'],
+                self._settings['dataset'],
+                config,
+                epsilon_of_contract=not self._settings['epsilon'],
             )
             deployment.check_optimizer_state(self._settings['optimizer_state'])
             engine = warm_up(deployment, inner_loop(self._settings))

@@ -85,6 +85,7 @@ class PolicyPublishers:
                 query_id=command.query_id,
                 values=command.values,
                 adapted=command.adapted,
+                withheld=bool(command.cause),
                 instance=self._instance,
                 world_id=state.world_id,
             )

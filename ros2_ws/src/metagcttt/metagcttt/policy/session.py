@@ -161,7 +161,9 @@ class PolicySession:
             Moment(message.world_id, message.episode_id, message.step), info['source_timestamp']
         )
         observation = to_array(message.observation)
-        fault = vector_fault('the state', observation, self.deployment.agent.obs_dim)
+        fault = self.deployment.contract_fault(message.contract) or vector_fault(
+            'the state', observation, self.deployment.agent.obs_dim
+        )
         if out_of_order:
             self._monitor.faults.note('states_out_of_order', out_of_order, now_s)
         elif fault:

@@ -8,11 +8,12 @@ from typing import Any
 
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from metagcttt.conventions import ConventionalNode
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import RECORDER_NODE
 from metagcttt.qos import recording_profile
@@ -27,7 +28,7 @@ ORDERS = ('goal_pose', 'stop')
 OF_ROS = ('/rosout', '/parameter_events')
 
 
-class RecorderNode(Node):
+class RecorderNode(ConventionalNode):
     """Records every topic of its namespace, and those that all robots share.
 
     Serialized messages go to the file unchanged. A subscription follows the QoS of the topic's
@@ -129,7 +130,12 @@ class RecorderNode(Node):
             self.get_logger().warning(f'{topic} is not recorded: {error}')
             return
         self._subscriptions_by_topic[topic] = self.create_subscription(
-            message_type, topic, partial(self._on_message, topic), profile, raw=True
+            message_type,
+            topic,
+            partial(self._on_message, topic),
+            profile,
+            raw=True,
+            qos_overriding_options=QoSOverridingOptions(()),  # it follows the publishers
         )
         self.get_logger().info(f'recording {topic} ({types[0]})')
 
@@ -137,7 +143,14 @@ class RecorderNode(Node):
         # Both of the system clock; the stamp in a header may be simulated, and stays inside.
         received = time.time_ns()
         published = info['source_timestamp'] or received
-        self._recording.add(topic, data, log_time=received, publish_time=published)
+        # Simulated time may run so fast that this node's own delay would matter.
+        is_simulated = self.get_parameter('use_sim_time').value
+        self._recording.add(
+            topic,
+            data,
+            log_time=published if is_simulated else received,
+            publish_time=published,
+        )
 
 
 def _quality(profile: QoSProfile) -> tuple[ReliabilityPolicy, DurabilityPolicy]:

@@ -12,11 +12,12 @@ from metagcttt_core.robot.types import has_header, type_faults
 from metagcttt_interfaces.msg import ActionCommand, MazeState
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
+from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
+from rclpy.duration import Duration
 from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool
 
+from metagcttt.conventions import ConventionalNode
 from metagcttt.converters import state_message, to_array
 from metagcttt.diagnostics import Diagnostics
 from metagcttt.health import Faults, Health, Level, Rate
@@ -28,15 +29,18 @@ from metagcttt.robot.messages import definitions, message_class, profile
 from metagcttt.robot.pilot import Pilot, Situation
 
 WARNING_PERIOD_S = 5.0
+RESTART = Duration(seconds=-1)
 EPISODE = 1
 LEVELS = {'fault': Level.ERROR, 'stop': Level.WARN, 'silent': Level.WARN}
 
 
-class RobotBridgeNode(Node):
+class RobotBridgeNode(ConventionalNode):
     """Publishes a robot's state at the rate of its contract, and the policy's actions as commands.
 
-    A robot is never reset, so there is one episode. Observations go by the node's clock; deadlines
-    of commands go by a steady one, as simulated time may stand still.
+    A robot is never reset, so there is one episode. Observations go by the node's clock, with
+    which the contract's `stamp: header` compares the robot's; deadlines of commands go by a steady
+    one, as simulated time may stand still. Where simulated time goes back, the simulation was
+    started again: that is another world, in which no goal is in force.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -49,19 +53,23 @@ class RobotBridgeNode(Node):
             ContractError: If the contract is wrong or its message types do not have its fields.
         """
         super().__init__('robot_bridge_node', **kwargs)
-        self._world_id = secrets.randbits(64) or 1  # 0 stands for none
         self._settings = ParameterSet(self, ROBOT_BRIDGE_NODE, is_configured=lambda: True)
         self._contract = load_contract(Path(self._settings['contract']).expanduser())
         if faults := type_faults(self._contract, definitions):
             raise ContractError('\n'.join(faults))
+        self._fingerprint = self._contract.identity['fingerprint']
         self._observer = Observer(self._contract)
         self._pilot = Pilot(self._contract)
+        self._begin_world()
+        self._jumps = self.get_clock().create_jump_callback(
+            JumpThreshold(min_forward=None, min_backward=RESTART),
+            post_callback=self._on_time_back,
+        )
         self._policies = Senders()
         self._faults = Faults()
         self._rate = Rate()
         self._step = 0
         self._ended = False
-        self._frame = next((t.frame_id for t in self._contract.observe if t.frame_id), '')
 
         self._states = self.create_publisher(MazeState, 'state', keep_several(SENSOR))
         self._stamped = [has_header(topic.type, definitions) for topic in self._contract.act]
@@ -91,11 +99,30 @@ class RobotBridgeNode(Node):
             f'{self._contract.act_dim} values at {self._contract.rate_hz:g} Hz'
         )
 
+    def destroy_node(self) -> None:
+        """Stop following the clock, then destroy the node."""
+        self._jumps.unregister()
+        super().destroy_node()
+
     def end_service(self) -> None:
         """Send the last commands; nothing is sent after them."""
         self._ended = True
         for number, command in self._pilot.farewell(time.monotonic_ns()):
             self._send(number, command)
+
+    def _begin_world(self) -> None:
+        """Draw the identity of a world in which nothing was observed yet."""
+        self._world_id = secrets.randbits(64) or 1  # 0 stands for none
+        self._observer.begin_again()
+        self._pilot.forget()
+
+    def _on_time_back(self, jump: TimeJump) -> None:
+        """Begin another world: the simulation of the robot was started again."""
+        self._begin_world()
+        seconds = -jump.delta.nanoseconds / 1e9
+        self.get_logger().warning(
+            f'the clock went back by {seconds:.1f} s: another world begins, and no goal is in it'
+        )
 
     # --- input -------------------------------------------------------------------------------
 
@@ -112,7 +139,9 @@ class RobotBridgeNode(Node):
         if message.episode_id != EPISODE:
             self._note('refused_actions', f'the action is for episode {message.episode_id}')
             return
-        refusal = self._pilot.take_action(message.step, message.query_id, to_array(message.values))
+        refusal = self._pilot.take_action(
+            message.step, message.query_id, to_array(message.values), withheld=message.withheld
+        )
         if refusal:
             self._note('refused_actions', refusal)
         else:
@@ -153,7 +182,7 @@ class RobotBridgeNode(Node):
         self._pilot.saw_observation(self._step, observation, time.monotonic_ns())
         self._rate.add(time.monotonic())
         x, y = self._position(observation)
-        header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self._frame)
+        header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self._contract.frame_id)
         self._states.publish(
             state_message(
                 header,
@@ -165,6 +194,7 @@ class RobotBridgeNode(Node):
                 terminated=False,
                 truncated=False,
                 success=False,
+                contract=self._fingerprint,
             )
         )
 
@@ -185,6 +215,17 @@ class RobotBridgeNode(Node):
         for publisher in self._commands:
             if self.count_publishers(publisher.topic_name) > 1:
                 return f'others publish on {publisher.topic_name}'
+        return ''
+
+    def _strangers(self) -> str:
+        """Who publishes what is observed as another type, which never arrives; or empty."""
+        for topic in self._contract.observe:
+            name = self.resolve_topic_name(topic.topic)
+            types = {each.topic_type for each in self.get_publishers_info_by_topic(name)}
+            if types and topic.type not in types:
+                return (
+                    f'{topic.topic} is published as {", ".join(sorted(types))}, not {topic.type}'
+                )
         return ''
 
     def _send(self, number: int, command: NDArray[np.float64]) -> None:
@@ -209,11 +250,12 @@ class RobotBridgeNode(Node):
         now_ns = time.monotonic_ns()
         found = [(t.topic, self._pilot.situation(t, now_ns)) for t in self._contract.act]
         worst = max((s for _, s in found), key=lambda s: LEVELS.get(s.case, Level.OK))
+        strangers = self._strangers() if self._observer.late else ''
         recent = self._faults.recent(now_ns / 1e9)
         level = LEVELS.get(worst.case, Level.WARN if recent else Level.OK)
         return Health(
             level,
-            worst.reason or recent or 'the policy commands',
+            strangers or worst.reason or recent or 'the policy commands',
             {
                 'state_rate_hz': f'{self._rate.per_second(now_ns / 1e9):.1f}',
                 **{topic: _in_words(situation) for topic, situation in found},

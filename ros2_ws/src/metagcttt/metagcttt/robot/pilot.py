@@ -16,6 +16,7 @@ REMEMBERED_STEPS = 1000
 @dataclass(frozen=True)
 class _Action:
     values: NDArray[np.float64]
+    withheld: bool
     query_id: int
     observed_ns: int
     observation: NDArray[np.float64]
@@ -59,8 +60,17 @@ class Pilot:
         self._steps[step] = (now_ns, observation)
         self._steps.pop(step - REMEMBERED_STEPS, None)
 
-    def take_action(self, step: int, query_id: int, values: NDArray[np.float64]) -> str:
-        """Take in the action for the observation of `step`; returns why it is refused, or ''."""
+    def take_action(
+        self, step: int, query_id: int, values: NDArray[np.float64], *, withheld: bool = False
+    ) -> str:
+        """Take in the action for the observation of `step`; returns why it is refused, or ''.
+
+        Args:
+            step: The step that it answers.
+            query_id: The goal that it serves; 0 for none.
+            values: The action; zeros are an action like any other.
+            withheld: The policy says that it does not act, whatever the values are.
+        """
         if fault := vector_fault('the action', values, self._contract.act_dim):
             return fault
         if step not in self._steps:
@@ -68,8 +78,13 @@ class Pilot:
         observed_ns, observation = self._steps[step]
         if self._action is not None and observed_ns < self._action.observed_ns:
             return f'the action for step {step} came after that for a newer one'
-        self._action = _Action(values, query_id, observed_ns, observation)
+        self._action = _Action(values, withheld, query_id, observed_ns, observation)
         return ''
+
+    def forget(self) -> None:
+        """Forget observations and actions, which are of another world now."""
+        self._steps.clear()
+        self._action = None
 
     def situation(self, topic: CommandTopic, now_ns: int) -> Situation:
         """The reason to fall back, or none."""
@@ -85,8 +100,7 @@ class Pilot:
             return Situation('silent', f'the newest action is for {age_s:.2f} s ago')
         if not action.query_id:
             return Situation('no_goal', 'no goal')
-        # The policy sends zeros when the robot must not move; zero may be a motion here.
-        if not action.values.any():
+        if action.withheld:
             return Situation('silent', 'the policy keeps the robot still')
         return Situation()
 

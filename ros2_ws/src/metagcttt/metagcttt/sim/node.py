@@ -10,7 +10,6 @@ from metagcttt_interfaces.srv import SetTask
 from nav_msgs.msg import OccupancyGrid
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
@@ -19,6 +18,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
 from metagcttt.clocks import STEADY
+from metagcttt.conventions import ConventionalNode
 from metagcttt.converters import (
     occupancy_grid,
     state_message,
@@ -47,7 +47,7 @@ HEARTBEAT_S = 0.1
 LOCKSTEP_HEARTBEAT_S = 1.0
 
 
-class SimBridgeNode(Node):
+class SimBridgeNode(ConventionalNode):
     """Steps one simulator with the actions received and publishes its states.
 
     In `realtime` it steps on its own, with the newest action or, when that has timed out, with

@@ -10,12 +10,12 @@ from metagcttt_interfaces.msg import AdaptationReport, GoalQuery, MazeState
 from nav_msgs.msg import Odometry, Path
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.node import Node
 from sim_bridge import describe_environment
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
 from metagcttt.clocks import STEADY
+from metagcttt.conventions import ConventionalNode
 from metagcttt.converters import to_array
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import VISUALIZATION_NODE
@@ -31,7 +31,7 @@ from metagcttt.visualization.messages import (
 SPACING_M = 0.1
 
 
-class VisualizationNode(Node):
+class VisualizationNode(ConventionalNode):
     """Publishes odometry with every state; path and markers, which are large, at a low rate."""
 
     def __init__(self, **kwargs: Any) -> None:

@@ -1,4 +1,4 @@
-"""What computes the gradient steps of the inner loop, and which an agent gets."""
+"""What computes gradient steps, and which an agent gets."""
 
 from collections.abc import Callable, Sequence
 from typing import Literal, Protocol
@@ -6,11 +6,10 @@ from typing import Literal, Protocol
 import torch
 from torch import nn, Tensor
 
-from metagcttt_core.adaptation.config import EngineName
 from metagcttt_core.agents.agent import Agent, TensorBatch
 from metagcttt_core.agents.analytic import AnalyticLoss
 from metagcttt_core.kernels import Kernels, KernelsUnavailable, load_kernels
-from metagcttt_core.training.config import Precision
+from metagcttt_core.training.config import EngineName, Precision
 from metagcttt_core.training.numerics import resolve_precision
 from metagcttt_core.training.optimizers import KernelAdam
 from metagcttt_core.training.step import gradient_step

@@ -3,9 +3,9 @@
 import copy
 
 from metagcttt_core import adapt, kernels
-from metagcttt_core.adaptation.engine import make_engine
 from metagcttt_core.adaptation.inner_loop import run_inner_loop
 from metagcttt_core.agents import GCBC
+from metagcttt_core.training.engine import make_engine
 from metagcttt_core.training.optimizers import make_optimizer
 import numpy as np
 import pytest

@@ -1,0 +1,96 @@
+"""Trainings on a Ray cluster of two machines that this one plays."""
+
+import os
+from pathlib import Path
+import signal
+import threading
+import time
+
+from metagcttt_core import load_checkpoint
+from metagcttt_tools import pretrain
+from metagcttt_tools.benchmarks import cluster as benchmark
+from metagcttt_tools.common.run_log import last_step
+from metagcttt_tools.common.stopping import Stop
+from metagcttt_tools.jobs.program import ATTEMPT, Invocation, JobError
+from metagcttt_tools.jobs.scheduler import Job, Resources, run_all
+import pytest
+from tests.core.builders import maze_walks
+import yaml
+
+pytest.importorskip('ray', reason='needs the extra cluster: pip install "metagcttt-core[cluster]"')
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+
+STEPS, EVERY = 3000, 300
+
+
+def settings(folder, seed):
+    return {
+        'dataset': str(folder / 'walks.npz'),
+        'out': str(folder / f'run-{seed}'),
+        'seed': seed,
+        'hidden': [16],
+        'training': {'steps': STEPS, 'batch_size': 32},
+        'checkpoint_every': EVERY,
+        'log_every': EVERY,
+        'resume': True,
+    }
+
+
+def training(folder, seed):
+    preset = folder / f'run-{seed}.yaml'
+    preset.write_text(yaml.safe_dump({'pretrain': settings(folder, seed)}))
+    out = folder / f'run-{seed}'
+    invocation = Invocation('pretrain', preset, out, folder)
+    return Job(invocation, STEPS, lambda: last_step(out))
+
+
+@pytest.fixture(scope='module')
+def ray_cluster():
+    with benchmark.two_machines() as machines, pytest.MonkeyPatch.context() as patch:
+        patch.setenv('RAY_ADDRESS', machines.address)
+        yield machines
+
+
+def test_a_machine_that_dies_costs_no_bit_of_the_results(ray_cluster, tmp_path, capsys):
+    """Its raylet and the training on it are killed in the middle."""
+    from metagcttt_tools.jobs.cluster import RayScheduler
+
+    maze_walks().save(tmp_path / 'walks.npz')
+    scheduler = RayScheduler(Resources())
+    assert (
+        'cluster: 3 machines, 2 cores, 0 GPUs; dashboard: not started' in capsys.readouterr().out
+    )
+    failures = []
+
+    def kill():
+        log = tmp_path / 'run-0'
+        deadline = time.monotonic() + 400
+        while not EVERY <= last_step(log) < STEPS:
+            if time.monotonic() > deadline:
+                return failures.append('no checkpoint in time')
+            time.sleep(0.01)
+        program = benchmark.programs_of(log)[0]
+        raylet = benchmark.parent_of(benchmark.parent_of(program))
+        os.kill(program, signal.SIGKILL)
+        os.kill(raylet, signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    run_all('pretrain', [training(tmp_path, seed) for seed in (0, 1)], scheduler, Stop())
+    killer.join()
+    assert failures == []
+    attempts = (tmp_path / 'run-0.log').read_text().split(f'{ATTEMPT} ')[1:]
+    assert len(attempts) == 2
+    assert 'continues after step' in attempts[1]
+    for seed in (0, 1):
+        alone = tmp_path / 'alone' / f'{seed}'
+        preset = tmp_path / f'{seed}.yaml'
+        values = {**settings(tmp_path, seed), 'out': str(alone)}
+        preset.write_text(yaml.safe_dump({'pretrain': values}))
+        pretrain.main(['--preset', str(preset)])
+        found = load_checkpoint(tmp_path / f'run-{seed}' / 'checkpoint')
+        assert found.fingerprint() == load_checkpoint(alone / 'checkpoint').fingerprint()
+
+    too_wide = Job(Invocation('evaluate', Path('a'), Path('b'), tmp_path), 1, lambda: 0, cpus=8)
+    with pytest.raises(JobError, match='evaluate asks for 8 of CPU on one machine, the largest'):
+        scheduler.submit(too_wide)

@@ -1,0 +1,1 @@
+"""Runs of programs as jobs: on this machine, or on a Ray cluster."""
