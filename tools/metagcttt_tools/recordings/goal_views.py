@@ -76,7 +76,10 @@ def read_goal_views(
     ]
     if not views:
         raise DatasetError(f'{recording}: no goal was in force while {robot}/state was recorded')
-    return maze_of(by_type[_GRID][-1]), views
+    try:
+        return maze_of(by_type[_GRID][-1]), views
+    except ValueError as error:
+        raise DatasetError(f'{recording}: the map on {robot}/map is false ({error})') from error
 
 
 def _paths(
