@@ -5,7 +5,11 @@ import resource
 
 from hypothesis import HealthCheck, settings
 import pytest
+from sim_bridge.opengl import choose_opengl_library
 import torch
+
+# Test files import MuJoCo themselves, and it reads the choice only once.
+choose_opengl_library()
 
 # Results do not depend on how many workers share the machine.
 torch.set_num_threads(1)

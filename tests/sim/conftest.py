@@ -4,10 +4,6 @@ from collections.abc import Iterator
 
 import pytest
 from sim_bridge import make_simulator, Simulator
-from sim_bridge.opengl import choose_opengl_library
-
-# Test files import MuJoCo themselves, and it reads the choice only once.
-choose_opengl_library()
 
 
 @pytest.fixture(scope='session')

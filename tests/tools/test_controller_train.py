@@ -137,5 +137,5 @@ def test_measurement_tells_speed_and_falls_by_direction(
     assert (tmp_path / 'ant.png').stat().st_size > 10_000
     text = (tmp_path / 'ant.md').read_text()
     assert text in capsys.readouterr().out
-    for start in ('| 240° |', '| straight on | 0.1 |', '| antmaze-medium-v0 | 0 |'):
+    for start in ('| 240° |', '| straight on | 0.1 |', '| antmaze-medium-v0 | upright | 0 |'):
         assert start in squeezed(text)

@@ -103,8 +103,14 @@ def test_measurement_counts_falls(trained: Path, tmp_path: Path) -> None:
     report = json.loads((tmp_path / 'humanoid.json').read_text())
     for row in (*report['directions'], *report['walks']):
         assert row['falls'] >= 1
-    for row in report['mazes']:
+    upright, dropped = (
+        [row for row in report['mazes'] if row['start'] == start]
+        for start in ('upright', 'dropped')
+    )
+    for row in upright:
         assert (row['reached'], row['falls'], row['episodes']) == (0, 5, 5)
+    for row in dropped:  # up again after each fall, until the time is over
+        assert row['falls'] > 5
         assert row['seconds_to_goal'] is None
 
 

@@ -10,20 +10,11 @@ from functools import lru_cache
 import multiprocessing
 from pathlib import Path
 import sys
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 from metagcttt_core import FilterConfig, TrajectoryDataset, TrajectoryFilter
 from metagcttt_core.adaptation import TTTSettings
 from metagcttt_core.config import Settings
-from metagcttt_core.evaluation.offline import (
-    bootstrap,
-    draw_queries,
-    evaluate_query,
-    hold_out,
-    interval,
-    Outcome,
-    Query,
-)
 from metagcttt_core.files import read_json, write_json
 import numpy as np
 from numpy.typing import NDArray
@@ -35,9 +26,12 @@ from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.results import markdown_table
 from metagcttt_tools.common.session import provenance, sole_writer, use_threads
 
+if TYPE_CHECKING:
+    from metagcttt_core.evaluation.offline import Outcome, Query
+
 _DESCRIPTION = """How near policies are to held-out trajectories, without a simulator.
 
-Example: metagcttt evaluate --offline --checkpoints out/pretrain/checkpoint --grid
+Example: metagcttt evaluate-offline --checkpoints out/pretrain/checkpoint --grid
 A state of a held-out trajectory and a later one of it as the goal are a query: filter, adapt, and
 compare actions with the recorded ones on that way. --grid ranks radius, K and learning rate."""
 
@@ -116,6 +110,8 @@ class Arm(NamedTuple):
 def main(argv: list[str] | None = None) -> None:
     """Run the program."""
     settings = parse(OfflineSettings, _DESCRIPTION, 'evaluate-offline', argv)
+    from metagcttt_core.evaluation.offline import draw_queries
+
     from metagcttt_tools.common import offline_plots, plots
 
     try:
@@ -151,6 +147,8 @@ def main(argv: list[str] | None = None) -> None:
 
 def split(settings: OfflineSettings) -> tuple[str, TrajectoryDataset, TrajectoryDataset]:
     """Where the held-out trajectories are from, in words; the data to adapt on; and they."""
+    from metagcttt_core.evaluation.offline import hold_out
+
     dataset = TrajectoryDataset.load(settings.dataset)
     beside = settings.dataset.with_name(f'{settings.dataset.stem}-val.npz')
     path = settings.held_out or (beside if beside.exists() else None)
@@ -257,6 +255,7 @@ def _filter(epsilon: float) -> TrajectoryFilter:
 
 def _outcomes(arm: Arm, first: int) -> list[Outcome]:
     from metagcttt_core import load_checkpoint
+    from metagcttt_core.evaluation.offline import evaluate_query
 
     settings = _Worker.settings
     agent = load_checkpoint(arm.checkpoint)
@@ -306,6 +305,8 @@ def summarise(
 
 def _figures(found: Sequence[Outcome], budgets: Sequence[int]) -> list[dict[str, Any]]:
     """Error, likelihood and how both changed by adapting, with intervals, for each budget."""
+    from metagcttt_core.evaluation.offline import bootstrap, interval
+
     trajectories = np.array([outcome.trajectory for outcome in found])
     squares = bootstrap(_table([o.errors for o in found], budgets), trajectories)
     densities = bootstrap(_table([o.log_likelihoods for o in found], budgets), trajectories)
@@ -400,6 +401,8 @@ def correlation(
     Raises:
         ValueError: If there are less than three.
     """
+    from metagcttt_core.evaluation.offline import bootstrap, interval
+
     pairs = {
         key: (-row['error']['mean'], success[key])
         for row in results

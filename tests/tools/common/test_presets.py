@@ -43,10 +43,10 @@ def test_unknown_name_is_refused_with_the_nearest_known_one(name, message):
 @pytest.mark.parametrize(
     ('content', 'message'),
     [
-        ('a: [1, 2', r'preset .*mine\.yaml is not valid YAML'),
-        ('- 1\n- 2\n', r'preset .*mine\.yaml must hold a mapping of settings, got list'),
-        ('', r'preset .*mine\.yaml must hold a mapping of settings, got NoneType'),
-        ('!!python/object/apply:os.getcwd []', r'preset .*mine\.yaml is not valid YAML'),
+        ('a: [1, 2', r'mine\.yaml:1: not valid YAML'),
+        ('- 1\n- 2\n', r'mine\.yaml:1: must hold a mapping of settings'),
+        ('', r'mine\.yaml:1: must hold a mapping of settings'),
+        ('a: !!python/object/apply:os.getcwd []', r'mine\.yaml:1: not valid YAML'),
     ],
 )
 def test_malformed_file_is_refused(content, message, tmp_path):

@@ -9,6 +9,7 @@ from metagcttt_tools import (
     contract_check,
     controller_measure,
     controller_train,
+    controller_train_humanoid,
     diagnostics,
     download,
     generate,
@@ -382,6 +383,7 @@ def watch_humanoid_training(patch: pytest.MonkeyPatch, seen: Seen) -> None:
             return True
 
     patch.setattr(humanoid, 'HumanoidTraining', Training)
+    note_time_limits(patch, seen, controller_train_humanoid)
 
 
 HUMANOID = Walk(
