@@ -1,5 +1,6 @@
 """What the simulated robots have in common: their time, and sensors that are late."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 import heapq
 from itertools import count
@@ -32,7 +33,7 @@ def number(
     return float(node.declare_parameter(name, default, descriptor).value)
 
 
-class SimulatedRobot(Node):
+class SimulatedRobot(Node, ABC):
     """Simulated time, which `/clock` tells, at the pace of a factor or of the commands.
 
     With `speed_factor` 0 a period passes when a command has come, and after `patience_s` without
@@ -76,9 +77,9 @@ class SimulatedRobot(Node):
         self._timer = self.create_timer(period_s, self._on_timer, clock=steady)
         self._unanswered, self._answered = 0, False
 
+    @abstractmethod
     def sense(self) -> None:
-        """Send what the sensors say now; for subclasses."""
-        raise NotImplementedError
+        """Send what the sensors say now."""
 
     def header(self, frame_id: str) -> Header:
         """A header with the simulated time."""
