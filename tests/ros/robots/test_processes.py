@@ -6,13 +6,14 @@ from pathlib import Path
 import subprocess
 import sys
 
+from geometry_msgs.msg import TwistStamped
 from metagcttt_core import TrajectoryDataset
 from metagcttt_core.robot import load_contract
 from metagcttt_tools import import_bags
 from nav_msgs.msg import OccupancyGrid, Odometry
 import numpy as np
 import pytest
-from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
 from tests.ros.graph import EVERY, Graph, RELIABLE
 
 ROBOTS = 'metagcttt_robots'
@@ -36,8 +37,8 @@ def test_a_robot_loads_nothing_of_the_method(module: str) -> None:
 @pytest.mark.parametrize(
     ('robot', 'contract', 'topic', 'message_type', 'values'),
     [
-        ('diffbot', 'diffbot.yaml', 'odom', Odometry, (6, 2)),
-        ('arm', 'arm4.yaml', 'joint_states', JointState, (8, 4)),
+        ('diffbot', 'diffbot.yaml', 'cmd_vel', TwistStamped, (6, 2)),
+        ('arm', 'arm4.yaml', 'arm_controller/commands', Float64MultiArray, (8, 4)),
     ],
 )
 def test_a_driven_robot_is_recorded_and_becomes_a_dataset(
@@ -61,7 +62,7 @@ def test_a_driven_robot_is_recorded_and_becomes_a_dataset(
         lambda: all(f'recording /{name} ' in recorder.log.read_text() for name in topics),
         'the recorder to find every topic',
     )
-    seen.clear()
+    seen.clear()  # the commands
     graph.wait(lambda: len(seen) > 150, 'the drive')
     assert driver.stop() == simulator.stop() == recorder.stop() == 0
     out = tmp_path / 'robot.npz'
