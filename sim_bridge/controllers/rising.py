@@ -4,8 +4,9 @@ import hashlib
 
 import numpy as np
 
-from sim_bridge.controllers.humanoid import head_height, HumanoidFollower
+from sim_bridge.controllers.humanoid import head_height
 from sim_bridge.controllers.humanoid_get_up import STANDING_HEAD_M
+from sim_bridge.controllers.learned import LearnedFollower
 from sim_bridge.controllers.posture import FALLEN_HEAD_M
 from sim_bridge.simulator import Array
 
@@ -20,7 +21,7 @@ class RisingHumanoid:
     head is lower than `FALLEN_HEAD_M`, until it was above `STANDING_HEAD_M` for `STEADY_STEPS`.
     """
 
-    def __init__(self, walker: HumanoidFollower, riser: HumanoidFollower) -> None:
+    def __init__(self, walker: LearnedFollower, riser: LearnedFollower) -> None:
         """Take the policy that walks and the one that gets up."""
         self.walker = walker
         self.riser = riser

@@ -176,12 +176,11 @@ def summarize_goals(
 ) -> dict[str, Any]:
     """The figures of the tasks of a maze, `dropped` with a humanoid that gets up."""
     maze = OGBenchMaze(f'{follower.robot}maze-{layout}-v0')
+    riser = HumanoidFollower.load(GET_UP) if dropped else None
     with maze:
         runs = [
             walk_to_goal(
-                RisingHumanoid(follower, HumanoidFollower.load(GET_UP))
-                if isinstance(follower, HumanoidFollower)
-                else follower,
+                RisingHumanoid(follower, riser) if riser else follower,
                 maze,
                 task.task_id,
                 settings.seed + number,

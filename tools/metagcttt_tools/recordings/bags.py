@@ -5,8 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from mcap.records import Message
+from metagcttt_core.config.yaml_file import read_yaml, SettingsFileError
 from metagcttt_core.data.errors import DatasetError
-import yaml
 
 from metagcttt_tools.common.bags import open_any_bag, reading
 from metagcttt_tools.recordings.mcap import Clocks, read_messages, Recorded, RecordedMessages
@@ -36,13 +36,14 @@ def read_bag(path: Path, type_names: Collection[str]) -> RecordedMessages:
 def _mcap_files(folder: Path) -> list[Path]:
     """The MCAP files of a bag in order; empty when it has other files."""
     names = [file.name for file in folder.iterdir() if file.suffix == '.mcap']
-    try:
-        text = (folder / 'metadata.yaml').read_text(encoding='utf-8')
-        names = yaml.safe_load(text)['rosbag2_bagfile_information']['relative_file_paths']
-    except FileNotFoundError:  # the recorder was killed
+    metadata = folder / 'metadata.yaml'
+    if metadata.exists():
+        try:
+            names = read_yaml(metadata)[1]['rosbag2_bagfile_information']['relative_file_paths']
+        except (SettingsFileError, LookupError, TypeError) as error:
+            raise DatasetError(f'{metadata}: cannot be read ({error})') from error
+    else:  # the recorder was killed
         names.sort(key=lambda name: (len(name), name))  # NAME_10 after NAME_9
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, LookupError, TypeError) as error:
-        raise DatasetError(f'{folder}/metadata.yaml: cannot be read ({error})') from error
     files = [folder / Path(str(name)).name for name in names or ()]
     return files if all(file.suffix == '.mcap' for file in files) else []
 
