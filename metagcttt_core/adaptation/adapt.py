@@ -8,10 +8,10 @@ import numpy as np
 import torch
 
 from metagcttt_core.adaptation.batches import QueryBatches
-from metagcttt_core.adaptation.config import TTTConfig
+from metagcttt_core.adaptation.config import GuardName, TTTConfig
 from metagcttt_core.adaptation.inner_loop import run_inner_loop
 from metagcttt_core.adaptation.result import Adaptation, OnStep
-from metagcttt_core.agents.agent import Agent
+from metagcttt_core.agents.agent import Agent, TensorBatch
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.retrieval.support import SupportSet
 from metagcttt_core.training.optimizers import pretrained_state
@@ -41,9 +41,9 @@ def adapt(
         on_step: Called after every gradient step, with the losses by part.
 
     Returns:
-        The expert and its losses. An empty support, zero steps, weights that became non-finite or,
-        with early stopping, a held-out loss that only got worse give the base agent, not accepted,
-        with the reason.
+        The expert and its losses. An empty support, zero steps, weights that became non-finite,
+        with early stopping a held-out loss that only got worse or, with a guard, one that did not
+        fall give the base agent, not accepted, with the reason.
 
     Raises:
         AdaptationCancelled: When `should_stop` returned true.
@@ -68,7 +68,7 @@ def adapt(
     split_seed, batch_seed = np.random.SeedSequence(seed).spawn(2)
     rng = np.random.default_rng(batch_seed)
     train, test = support, None
-    if config.early_stopping:
+    if config.early_stopping or config.guard != 'off':
         train, test = support.split(
             config.test_fraction, config.max_test, np.random.default_rng(split_seed)
         )
@@ -98,7 +98,7 @@ def adapt(
         lr=config.lr,
         optimizer=config.optimizer,
         optimizer_state=state,
-        test_batch=test_batch,
+        test_batch=test_batch if config.early_stopping else None,
         actor_only=config.actor_only,
         engine=config.engine,
         precision=config.precision,
@@ -109,7 +109,23 @@ def adapt(
         return base('the held-out loss never fell below its start', result)
     if not all(torch.isfinite(weight).all() for weight in result.agent.parameters()):
         return base('the adapted weights are not finite', result)
+    if config.guard != 'off':
+        before, after = (
+            _held_out(each, test_batch, config.guard, actor_only=config.actor_only)
+            for each in (agent, result.agent)
+        )
+        if not after < before:
+            return base(
+                f'the held-out {config.guard} went from {before:.4g} to {after:.4g}', result
+            )
     return ended(result)
+
+
+@torch.no_grad()
+def _held_out(agent: Agent, batch: TensorBatch, measure: GuardName, *, actor_only: bool) -> float:
+    """What a guard compares: the agent's loss, or the negative log-likelihood of the actions."""
+    loss, parts = agent.losses(batch, actor_only=actor_only)
+    return float(parts['bc'] if measure == 'imitation' else loss)
 
 
 def _check(agent: Agent, dataset: TrajectoryDataset, goal: np.ndarray) -> None:

@@ -7,6 +7,8 @@ from pydantic import Field, model_validator
 from metagcttt_core.config.settings import Settings
 from metagcttt_core.training.config import EngineName, OptimizerName, Precision
 
+GuardName = Literal['off', 'loss', 'imitation']
+
 
 class InnerLoopConfig(Settings):
     """Settings shared by test-time training and the inner loop of post-training."""
@@ -38,6 +40,11 @@ class TTTLoopConfig(InnerLoopConfig):
         'fresh', description='Adam moments and step count to begin with'
     )
     early_stopping: bool = Field(False, description='hold out a test split and keep the best step')
+    guard: GuardName = Field(
+        'off',
+        description='hold out a test split and act with the base policy unless the loss on it, or '
+        'the negative log-likelihood of its actions (imitation), fell',
+    )
 
     @model_validator(mode='after')
     def _state_is_of_adam(self) -> Self:

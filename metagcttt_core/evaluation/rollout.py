@@ -138,8 +138,9 @@ def evaluate_success(
         trajectory_filter: A filter to use instead of one made from `dataset`.
 
     Returns:
-        `tasks` (success rate by task number), `mean` (over tasks) and `steps` (mean control steps
-        of the successful episodes by task number, None without any).
+        `tasks` (success rate by task number), `mean` (over tasks), `steps` (mean control steps
+        of the successful episodes by task number, None without any) and `accepted` (share of the
+        adaptations whose expert was accepted, None without any).
     """
     if episodes < 1:
         raise ValueError(f'episodes must be at least 1, got {episodes}')
@@ -150,6 +151,7 @@ def evaluate_success(
         trajectory_filter = TrajectoryFilter(dataset)
     rates: dict[int, float] = {}
     steps: dict[int, float | None] = {}
+    accepted: list[bool] = []
     for task_id in task_ids:
         results = [
             run_episode(
@@ -165,7 +167,13 @@ def evaluate_success(
         rates[task_id] = float(np.mean([episode.success for episode in results]))
         reached = [episode.steps for episode in results if episode.success]
         steps[task_id] = float(np.mean(reached)) if reached else None
-    return {'tasks': rates, 'mean': float(np.mean(list(rates.values()))), 'steps': steps}
+        accepted += [each.accepted for episode in results for each in episode.adaptations]
+    return {
+        'tasks': rates,
+        'mean': float(np.mean(list(rates.values()))),
+        'steps': steps,
+        'accepted': float(np.mean(accepted)) if accepted else None,
+    }
 
 
 def episode_seed(seed: int, task_id: int, number: int) -> int:

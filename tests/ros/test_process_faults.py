@@ -141,6 +141,7 @@ def test_goal_that_changes_every_100_ms_ends_well(robot: Robot) -> None:
     assert all(np.isfinite(action.values).all() for action in robot.record.actions)
 
 
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM], ids=['ctrl-c', 'sigterm'])
 def test_policy_ends_cleanly_while_it_adapts(robot: Robot, number: int) -> None:
     robot.start('sim_bridge_node', 'goal_node')
     robot.start('policy_node', adapt_steps=10000, adapt_batch_size=1024)

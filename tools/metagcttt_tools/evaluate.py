@@ -112,6 +112,8 @@ def main(argv: list[str] | None = None) -> None:
 def evaluate(settings: EvaluateSettings, program: Resumable) -> list[dict[str, Any]]:
     """Success by policy and budget: rates per seed, their mean and error, and the AUC.
 
+    Each point says, too, which share of the experts was accepted.
+
     Args:
         settings: What to evaluate.
         program: The settings to continue with after an interruption.
@@ -125,17 +127,22 @@ def evaluate(settings: EvaluateSettings, program: Resumable) -> list[dict[str, A
         for seed in settings.seeds
         for task in range(1, num_tasks + 1)
     ]
-    rates = _run_jobs(settings, program, jobs)
+    outcomes = _run_jobs(settings, program, jobs)
     results = []
     for path, environment in zip(settings.checkpoints, environments, strict=True):
         curve = []
         for budget in settings.budgets:
             key = (str(path), environment, budget)
-            tasks = {
-                task: [rates[*key, seed, task] for seed in settings.seeds]
+            rates = {
+                task: [outcomes[*key, seed, task][0] for seed in settings.seeds]
                 for task in range(1, num_tasks + 1)
             }
-            curve.append(success_point(budget, tasks))
+            shares = [
+                outcomes[*key, seed, task][1]
+                for seed in settings.seeds
+                for task in range(1, num_tasks + 1)
+            ]
+            curve.append({**success_point(budget, rates), 'accepted': float(np.mean(shares))})
         results.append(success_curve(path, curve))
     return results
 
@@ -185,8 +192,10 @@ def finished_jobs(out: Path) -> Path:
     return out.with_suffix('.partial.jsonl')
 
 
-def _run_jobs(settings: EvaluateSettings, program: Resumable, jobs: list[Job]) -> dict[Job, float]:
-    """Success rate of every job; jobs run in separate processes and are kept as they finish."""
+def _run_jobs(
+    settings: EvaluateSettings, program: Resumable, jobs: list[Job]
+) -> dict[Job, tuple[float, float]]:
+    """The outcome of every job; jobs run in separate processes and are kept as they finish."""
     from metagcttt_core import load_checkpoint
     from metagcttt_core.training.optimizers import pretrained_state
 
@@ -212,7 +221,7 @@ def _run_jobs(settings: EvaluateSettings, program: Resumable, jobs: list[Job]) -
     todo = [job for job in jobs if job not in log.finished]
     with tqdm(total=len(jobs), initial=len(jobs) - len(todo), unit='job', desc='evaluate') as bar:
         try:
-            futures = {pool.submit(_success_rate, job): job for job in todo}
+            futures = {pool.submit(_outcome, job): job for job in todo}
             for future in as_completed(futures):
                 log.add(futures[future], future.result())
                 bar.update()
@@ -258,7 +267,8 @@ def _start_worker(settings: EvaluateSettings, fingerprints: Mapping[str, str]) -
     )
 
 
-def _success_rate(job: Job) -> float:
+def _outcome(job: Job) -> tuple[float, float]:
+    """Success rate of a job, and the share of its adaptations whose expert was accepted."""
     from metagcttt_core import CheckpointError, evaluate_success, load_checkpoint
 
     path, environment, budget, seed, task = job
@@ -277,4 +287,4 @@ def _success_rate(job: Job) -> float:
         trajectory_filter=_Worker.trajectory_filter,
     )
     simulator.close()
-    return result['mean']
+    return result['mean'], result['accepted'] or 0.0

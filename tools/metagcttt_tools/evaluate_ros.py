@@ -39,6 +39,7 @@ _TTT_PARAMETERS = {
     'batch_size': 'adapt_batch_size',
     'early_stopping': 'early_stopping',
     'test_fraction': 'test_fraction',
+    'guard': 'guard',
     'actor_only': 'actor_only',
     'optimizer_state': 'optimizer_state',
     'horizon': 'horizon',

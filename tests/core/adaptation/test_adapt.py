@@ -199,6 +199,50 @@ def test_adaptation_that_only_makes_the_held_out_loss_worse_is_rejected(dataset)
     assert_bit_equal(agent, weights)
 
 
+@EVERY_AGENT
+@pytest.mark.parametrize('guard', ['loss', 'imitation'])
+@pytest.mark.parametrize(('optimizer', 'lr'), [('sgd', 1e-3), ('adam', 1.0)])
+def test_guard_accepts_an_expert_only_if_its_measure_falls_on_held_out_rows(
+    name, guard, optimizer, lr, dataset, monkeypatch
+):
+    agent = tiny_agent(name)
+    measured, losses = [], type(agent).losses
+
+    def spy(each, batch, *, actor_only=False):
+        loss, parts = losses(each, batch, actor_only=actor_only)
+        if not torch.is_grad_enabled():
+            measured.append((batch, (parts['bc'] if guard == 'imitation' else loss).item()))
+        return loss, parts
+
+    monkeypatch.setattr(type(agent), 'losses', spy)
+    settings = {'lr': lr, 'optimizer': optimizer, 'test_fraction': 0.3, 'engine': 'eager'}
+    config = quick(**settings, guard=guard)
+    result = adapt(agent, dataset, support_of(range(11)), GOAL, config)
+    (batch, before), (same_batch, after) = measured
+    assert batch is same_batch
+    assert len(batch['observations']) == 3
+    assert result.accepted == (after < before) == (lr < 1)
+    assert result.test_losses == []
+    if not result.accepted:
+        assert result.agent is agent
+        assert result.reason == f'the held-out {guard} went from {before:.4g} to {after:.4g}'
+
+
+def test_guard_leaves_the_steps_of_early_stopping_as_they_are(dataset):
+    results = [
+        adapt(
+            tiny_agent(),
+            dataset,
+            support_of(range(11)),
+            GOAL,
+            quick(early_stopping=True, lr=1e-3, guard=guard),
+        )
+        for guard in ('off', 'loss')
+    ]
+    assert results[0].test_losses == results[1].test_losses
+    assert results[0].best_step == results[1].best_step > 0
+
+
 def test_weights_that_become_non_finite_are_rejected(dataset):
     agent = tiny_agent()
     result = adapt(agent, dataset, support_of(range(11)), GOAL, quick(lr=1e30, optimizer='sgd'))

@@ -192,6 +192,20 @@ def test_early_stopping_keeps_the_base_policy_when_the_held_out_loss_only_gets_w
         assert report.reason == 'the held-out loss never fell below its start'
 
 
+def test_guard_keeps_the_base_policy_and_says_why(make_rig) -> None:
+    rig = make_rig(guard='imitation', test_fraction=0.5, adapt_lr=1.0, adapt_steps=2)
+    rig.set(adaptation='hold')
+    rig.state()
+    rig.goal()
+    report = rig.report()
+    assert not report.accepted
+    assert report.reason.startswith('the held-out imitation went from')
+    assert np.array_equal(rig.action().values, rig.base.act(ON_THE_WAY, TASK_1_GOAL))
+    rig.set(adapt_lr=0.003)
+    rig.goal(2)
+    assert rig.report(2).accepted
+
+
 def test_early_stopping_takes_the_step_that_does_best_on_the_held_out_part(make_rig) -> None:
     rig = make_rig(early_stopping=True, adapt_steps=8, adapt_lr=0.003, adaptation='hold')
     rig.state()

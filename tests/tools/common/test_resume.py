@@ -194,8 +194,8 @@ def test_policy_that_is_replaced_while_it_is_evaluated_is_refused(data, tmp_path
     fingerprint = load_checkpoint(base).fingerprint()
     evaluate._start_worker(settings, {str(base): fingerprint})
     job = (str(base), 'pointmaze-medium-v0', 0, 0, 1)
-    assert evaluate._success_rate(job) in (0, 1)
+    assert evaluate._outcome(job)[0] in (0, 1)
     other = load_checkpoint(pretrained(data, tmp_path / 'other', seed=1) / 'checkpoint')
     save_checkpoint(other, base)
     with pytest.raises(CheckpointError, match='was replaced while it was evaluated'):
-        evaluate._success_rate(job)
+        evaluate._outcome(job)

@@ -22,7 +22,7 @@ from tests.tools.settings.walk import (
 )
 
 CRITIC = {'checkpoints': ['@gciql']}
-LOOP = {**INNER_LOOP, 'optimizer_state': 'pretrained'}
+LOOP = {**INNER_LOOP, 'optimizer_state': 'pretrained', 'guard': 'imitation'}
 TTT = {**LOOP, 'lr': 0.1, 'horizon': 2}
 WIDE = {'filter.epsilon': 4.0, 'filter.top_percent': 50.0}
 QUICK = {**WIDE, 'ttt.batch_size': 8, 'dataset': '@walks.npz'}

@@ -65,6 +65,7 @@ EVALUATE_ROS = Walk(
         'ttt.batch_size': 9,
         'ttt.early_stopping': True,
         'ttt.test_fraction': 0.6,
+        'ttt.guard': 'loss',
         'ttt.actor_only': True,
         'ttt.horizon': 2,
         'ttt.optimizer_state': 'pretrained',

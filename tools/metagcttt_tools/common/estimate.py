@@ -74,7 +74,7 @@ def format_estimate(
 def _evaluation(settings: 'EvaluateSettings', rates: 'Rates') -> tuple[int, float]:
     """Episodes of an evaluation and the seconds they take at most."""
     ttt = settings.ttt
-    held_out = ttt.max_test if ttt.early_stopping else 0
+    held_out = ttt.max_test if ttt.early_stopping else 0  # a guard's two batches are not counted
     step = rates.gradient_step(ttt.batch_size, held_out, settings.actor_loss)
     spec = rates.simulator.spec
     limit = spec.max_episode_steps

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ValidationError
 
 class _Entry(BaseModel):
     job: tuple[str | int | float, ...]
-    result: float
+    result: float | tuple[float, ...]
 
 
 Job = TypeVar('Job', bound=tuple[Any, ...])
@@ -32,7 +32,7 @@ class JobLog(Generic[Job]):
             ValueError: If the file is of other settings; names the first that differs.
         """
         self._path = path
-        self.finished: dict[Job, float] = {}
+        self.finished: dict[Job, Any] = {}
         if resume and path.exists():
             self._read(settings)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -41,7 +41,7 @@ class JobLog(Generic[Job]):
         self._file = path.open('w', encoding='utf-8')
         self._write(*lines)
 
-    def add(self, job: Job, result: float) -> None:
+    def add(self, job: Job, result: float | tuple[float, ...]) -> None:
         """Keep the result of a job."""
         self.finished[job] = result
         self._write({'job': job, 'result': result})

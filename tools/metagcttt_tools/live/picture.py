@@ -203,14 +203,14 @@ class Picture:
         self._scene.show_field(name, color, self._points, actions, height_m)
 
 
+_LOOP_SETTINGS = ('early_stopping', 'test_fraction', 'guard', 'actor_only', 'optimizer_state')
+
+
 def _config(policy: dict[str, Any], steps: int) -> TTTConfig:
     """The inner loop of the policy node."""
     return TTTConfig(
         steps=steps,
         lr=policy['adapt_lr'],
         batch_size=policy['adapt_batch_size'],
-        **{
-            name: policy[name]
-            for name in ('early_stopping', 'test_fraction', 'actor_only', 'optimizer_state')
-        },
+        **{name: policy[name] for name in _LOOP_SETTINGS},
     )

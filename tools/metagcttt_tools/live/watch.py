@@ -27,7 +27,7 @@ from metagcttt_tools.live.words import health_of, news_of, WAITING
 
 _POLICY_SETTINGS = (
     *('checkpoint', 'dataset', 'adapt_steps', 'adapt_lr', 'adapt_batch_size'),
-    *('early_stopping', 'test_fraction', 'actor_only', 'optimizer_state'),
+    *('early_stopping', 'test_fraction', 'guard', 'actor_only', 'optimizer_state'),
 )
 _ANSWER_S = 5.0
 _CONFIGURED_S = 60.0  # policy and dataset are loaded

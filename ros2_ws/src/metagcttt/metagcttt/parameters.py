@@ -143,8 +143,16 @@ POLICY_NODE = (
     Parameter(
         'test_fraction',
         0.2,
-        'fraction of the support set held out by early stopping',
+        'fraction of the support set held out by early stopping and the guard',
         (0.01, 0.99),
+        changes='now',
+    ),
+    Parameter(
+        'guard',
+        'off',
+        'hold out part of the support set and act with the base policy unless the loss on it, or '
+        'the negative log-likelihood of its actions (imitation), fell',
+        choices=('off', 'loss', 'imitation'),
         changes='now',
     ),
     Parameter('actor_only', False, 'adapt the actor and not the critic', changes='now'),

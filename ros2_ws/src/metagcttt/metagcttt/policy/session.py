@@ -32,6 +32,7 @@ def inner_loop(settings: ParameterSet) -> TTTConfig:
         lr=settings['adapt_lr'],
         batch_size=settings['adapt_batch_size'],
         early_stopping=settings['early_stopping'],
+        guard=settings['guard'],
         test_fraction=settings['test_fraction'],
         actor_only=settings['actor_only'],
         optimizer_state=settings['optimizer_state'],
