@@ -10,6 +10,7 @@ import re
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from metagcttt_core.agents.networks import MLP
 from metagcttt_core.kernels import Kernels, Layer
@@ -19,6 +20,8 @@ _A = 2 * math.sqrt(2 / math.pi)
 _B = 0.044715 * _A
 # Up to so many multiplications in a product, Python between layers costs more than oneDNN gains.
 _ONE_CALL = 2**24
+# Rows that are evaluated at a time, so that what lies between the layers stays in the cache.
+_BLOCK = 128
 # Below so many multiplications oneDNN's call costs more than the BLAS library's slower product.
 _SMALL_PRODUCT = 1_500_000
 _OPS = torch.ops.mkldnn if torch.backends.mkldnn.is_available() else None
@@ -32,6 +35,7 @@ class Passes(ABC):
 
     Attributes:
         gradients: Those of the last `backward`, one for each parameter, in the MLP's order.
+        out_dim: Width of the outputs.
     """
 
     def __init__(self, mlp: MLP, *, dtype: torch.dtype = torch.float32) -> None:
@@ -51,6 +55,7 @@ class Passes(ABC):
         ]
         self._by_layer = [[torch.zeros_like(w) for w in layer] for layer in self._layers]
         self.gradients = [gradient for layer in self._by_layer for gradient in layer]
+        self.out_dim = len(self._layers[-1][0])
         self._dtype = dtype
         self._rows = 0
         self._weights: list[Tensor] = []
@@ -67,6 +72,14 @@ class Passes(ABC):
             self._inputs.append(self._hidden(index, self._inputs[-1]).to(self._dtype))
         return product(self._inputs[-1], self._weights[-1], self._layers[-1][1]).to(torch.float32)
 
+    def evaluate(self, inputs: Tensor) -> Tensor:
+        """As `forward` without a backward pass to come; what the last `forward` keeps stays."""
+        x = inputs.to(self._dtype)
+        for index, layer in enumerate(self._layers[:-1]):
+            x = self._activated(index, product(x, layer[0].to(self._dtype))).to(self._dtype)
+        weight, bias = self._layers[-1]
+        return product(x, weight.to(self._dtype), bias).to(torch.float32)
+
     def backward(self, gradient: Tensor, *, weights: bool = True, inputs: bool = False) -> Tensor:
         """Take the gradient of the last forward pass's outputs (B, out_dim) back.
 
@@ -76,7 +89,7 @@ class Passes(ABC):
             inputs: Go on to the inputs.
 
         Returns:
-            With `inputs` the gradient with respect to them, (B, in_dim).
+            With `inputs` the gradient with respect to them, (B, in_dim), else `gradient`.
         """
         g = gradient
         if weights:
@@ -86,7 +99,7 @@ class Passes(ABC):
             if weights:
                 _weight_gradient(g, self._inputs[index], self._by_layer[index][0])
             if not index and not inputs:
-                break
+                return gradient
             g = product(g, self._weights[index].t()).to(torch.float32)
             if index:
                 g = self._hidden_backward(index - 1, g, weights)
@@ -99,6 +112,10 @@ class Passes(ABC):
     @abstractmethod
     def _hidden(self, index: int, inputs: Tensor) -> Tensor:
         """The outputs of a hidden layer, (B, units) float32."""
+
+    @abstractmethod
+    def _activated(self, index: int, product: Tensor) -> Tensor:
+        """What a hidden layer makes of its product, (B, units) float32; nothing is kept."""
 
     @abstractmethod
     def _hidden_backward(self, index: int, gradient: Tensor, weights: bool) -> Tensor:
@@ -119,6 +136,14 @@ class TensorPasses(Passes):
         if self._norm:
             x, *saved = torch.native_layer_norm(x, [x.shape[1]], layer[2], layer[3], 1e-6)
             self._saved[index] = tuple(saved)
+        return x
+
+    def _activated(self, index: int, product: Tensor) -> Tensor:
+        layer = self._layers[index]
+        z = product.to(torch.float32) + layer[1]
+        x = torch.mul(z, z).mul_(_B).add_(_A).mul_(z).sigmoid_().mul_(z)
+        if self._norm:
+            x = functional.layer_norm(x, [x.shape[1]], layer[2], layer[3], 1e-6)
         return x
 
     def _hidden_backward(self, index: int, gradient: Tensor, weights: bool) -> Tensor:
@@ -156,6 +181,9 @@ class FusedPasses(Passes):
                 setattr(struct, field, weight.data_ptr())
                 setattr(struct, f'{field}_slope', slope.data_ptr())
         self._network = (self._kernels.sgemm, ctypes.addressof(self._structs), len(self._structs))
+        self._by_blas = dtype == torch.float32 and _blas_keeps_up()
+        self._widest = max(struct.outputs for struct in self._structs)
+        self._room = torch.empty(2 * (_BLOCK + 1) * self._widest)
 
     def forward(self, inputs: Tensor) -> Tensor:
         """See `Passes`."""
@@ -165,9 +193,26 @@ class FusedPasses(Passes):
         if not self._at_once:
             return super().forward(inputs)
         self._inputs = [inputs.contiguous()]
-        outputs = torch.empty(self._rows, len(self._layers[-1][0]))
+        outputs = torch.empty(self._rows, self.out_dim)
         self._kernels.forward(
             *self._network, self._rows, self._inputs[0].data_ptr(), outputs.data_ptr()
+        )
+        return outputs
+
+    def evaluate(self, inputs: Tensor) -> Tensor:
+        """See `Passes`."""
+        if not self._by_blas:
+            return super().evaluate(inputs)
+        inputs = inputs.contiguous()
+        outputs = torch.empty(len(inputs), self.out_dim)
+        self._kernels.evaluate(
+            *self._network,
+            len(inputs),
+            inputs.data_ptr(),
+            outputs.data_ptr(),
+            _BLOCK,
+            self._widest,
+            self._room.data_ptr(),
         )
         return outputs
 
@@ -188,9 +233,8 @@ class FusedPasses(Passes):
         return gradient if into is None else into
 
     def _make_room(self) -> None:
-        widest = max(layer[0].numel() for layer in self._layers)
-        self._at_once = self._dtype == torch.float32 and self._rows * widest <= _ONE_CALL
-        self._at_once = self._at_once and _blas_keeps_up()
+        largest = max(layer[0].numel() for layer in self._layers)
+        self._at_once = self._by_blas and self._rows * largest <= _ONE_CALL
         self._outputs = []
         self._kept = []
         for struct in self._structs[:-1]:
@@ -207,6 +251,11 @@ class FusedPasses(Passes):
         output = product(inputs, self._weights[index]).to(torch.float32)
         self._outputs[index], struct.output = output, output.data_ptr()
         self._kernels.activate(ctypes.addressof(struct), self._rows)
+        return output
+
+    def _activated(self, index: int, product: Tensor) -> Tensor:
+        struct, output = ctypes.addressof(self._structs[index]), product.to(torch.float32)
+        self._kernels.activate_only(struct, len(output), output.data_ptr(), self._room.data_ptr())
         return output
 
     def _hidden_backward(self, index: int, gradient: Tensor, weights: bool) -> Tensor:

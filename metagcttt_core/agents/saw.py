@@ -8,7 +8,7 @@ pointmaze and antmaze as the defaults (giant mazes: discount 0.995), humanoidmaz
 """
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import ClassVar, TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -20,7 +20,11 @@ from metagcttt_core.agents.state_value import StateValue
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.data.relabel import GoalRelabeller
 
-_LARGEST_WEIGHT = 100.0
+if TYPE_CHECKING:
+    from metagcttt_core.agents.analytic import AnalyticLoss
+    from metagcttt_core.kernels import Kernels
+
+LARGEST_WEIGHT = 100.0
 
 
 class SAW(Agent):
@@ -170,12 +174,26 @@ class SAW(Agent):
         """The outputs of both networks, (2, B)."""
         return torch.stack([first(inputs), second(inputs)]).squeeze(-1)
 
+    def analytic_loss(
+        self,
+        *,
+        actor_only: bool = False,
+        dtype: torch.dtype = torch.float32,
+        kernels: 'Kernels | None' = None,
+    ) -> 'AnalyticLoss | None':
+        """See `Agent.analytic_loss`; on a processor, with unit standard deviations."""
+        from metagcttt_core.agents.analytic_saw import AnalyticSAW
+
+        if not self._has_analytic_loss_of(SAW):
+            return None
+        return AnalyticSAW(self, dtype, kernels, actor_only=actor_only)
+
     @torch.no_grad()
     def update_targets(self) -> None:
         """Move the target values by tau towards the values."""
-        for target, value in ((self.target1, self.value1), (self.target2, self.value2)):
-            for trailing, weight in zip(target.parameters(), value.parameters(), strict=True):
-                trailing.lerp_(weight, self.settings.tau)
+        targets: list[Tensor] = [*self.target1.parameters(), *self.target2.parameters()]
+        values: list[Tensor] = [*self.value1.parameters(), *self.value2.parameters()]
+        torch._foreach_lerp_(targets, values, self.settings.tau)
 
     @property
     def value_fn(self) -> StateValue:
@@ -184,7 +202,7 @@ class SAW(Agent):
 
 
 def _weight(exponent: Tensor) -> Tensor:
-    return exponent.exp().clamp(max=_LARGEST_WEIGHT)
+    return exponent.exp().clamp(max=LARGEST_WEIGHT)
 
 
 def _join(*parts: Tensor) -> Tensor:

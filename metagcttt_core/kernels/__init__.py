@@ -61,7 +61,11 @@ class Kernels:
         self.backward = bind(
             'backward', c_void_p, c_void_p, *[c_int64] * 2, *[c_void_p] * 3, c_int
         )
+        self.evaluate = bind(
+            'evaluate', *[c_void_p] * 2, *[c_int64] * 2, *[c_void_p] * 2, *[c_int64] * 2, c_void_p
+        )
         self.activate = bind('activate', c_void_p, c_int64)
+        self.activate_only = bind('activate_only', c_void_p, c_int64, c_void_p, c_void_p)
         self.activate_backward = bind('activate_backward', c_void_p, c_int64, c_void_p, c_int)
         self.nearest_per_episode = bind(
             'nearest_per_episode',

@@ -73,18 +73,32 @@ static float normalize(int64_t units, float *restrict h, const float *restrict s
     return inverse_std;
 }
 
-/* What follows the product of a hidden layer: `output` holds the product and gets the result. */
+/* What follows the product of a hidden layer, for one row in place; the inverse deviation. */
+static float activate_row(const struct layer *layer, float *row, float *slope, float *normed)
+{
+    gelu(layer->outputs, row, layer->bias, slope);
+    return layer->scale ? normalize(layer->outputs, row, layer->scale, layer->shift, normed)
+                        : 0.0f;
+}
+
+/* The same for all rows: `output` holds the product and gets the result. */
 void activate(const struct layer *layer, int64_t rows)
 {
     const int64_t units = layer->outputs;
     for (int64_t i = 0; i < rows; i++) {
-        float *row = layer->output + i * units;
-        gelu(units, row, layer->bias, layer->gelu_slope + i * units);
-        if (layer->scale) {
-            layer->inverse_std[i] =
-                normalize(units, row, layer->scale, layer->shift, layer->normed + i * units);
-        }
+        float *normed = layer->scale ? layer->normed + i * units : NULL;
+        const float inverse_std = activate_row(layer, layer->output + i * units,
+                                               layer->gelu_slope + i * units, normed);
+        if (layer->scale)
+            layer->inverse_std[i] = inverse_std;
     }
+}
+
+/* The same without a backward pass to come: `room` holds two rows, of what that would need. */
+void activate_only(const struct layer *layer, int64_t rows, float *product, float *room)
+{
+    for (int64_t i = 0; i < rows; i++)
+        activate_row(layer, product + i * layer->outputs, room, room + layer->outputs);
 }
 
 static void unnormalize(const struct layer *layer, float *restrict g,
@@ -175,6 +189,13 @@ static void weight_gradient(sgemm_t *sgemm, const struct layer *layer, int64_t r
     free(turned);
 }
 
+static void add_bias(const struct layer *head, int64_t rows, float *outputs)
+{
+    for (int64_t r = 0; r < rows; r++)
+        for (int64_t j = 0; j < head->outputs; j++)
+            outputs[r * head->outputs + j] += head->bias[j];
+}
+
 /* Map inputs (rows, in) to outputs (rows, out) through `count` layers, the last a head. */
 void forward(sgemm_t *sgemm, const struct layer *layers, int64_t count, int64_t rows,
              const float *inputs, float *outputs)
@@ -185,14 +206,35 @@ void forward(sgemm_t *sgemm, const struct layer *layers, int64_t count, int64_t 
         float *into = is_head ? outputs : layer->output;
         multiply(sgemm, 'N', 'T', rows, layer->outputs, layer->inputs, inputs, layer->weight,
                  into);
-        if (is_head) {
-            for (int64_t r = 0; r < rows; r++)
-                for (int64_t j = 0; j < layer->outputs; j++)
-                    outputs[r * layer->outputs + j] += layer->bias[j];
-        } else {
+        if (is_head)
+            add_bias(layer, rows, outputs);
+        else
             activate(layer, rows);
-        }
         inputs = into;
+    }
+}
+
+/* The same without a backward pass to come, so many rows at a time as `room` holds twice, and two
+ * more: 2 (block + 1) rows of the widest hidden layer. */
+void evaluate(sgemm_t *sgemm, const struct layer *layers, int64_t count, int64_t rows,
+              const float *inputs, float *outputs, int64_t block, int64_t widest, float *room)
+{
+    const struct layer *head = layers + count - 1;
+    float *const halves[] = {room, room + block * widest}, *scratch = room + 2 * block * widest;
+    for (int64_t done = 0; done < rows; done += block) {
+        const int64_t some = rows - done < block ? rows - done : block;
+        const float *from = inputs + done * layers->inputs;
+        for (int64_t i = 0; i < count; i++) {
+            const struct layer *layer = layers + i;
+            float *into = layer == head ? outputs + done * head->outputs : halves[i % 2];
+            multiply(sgemm, 'N', 'T', some, layer->outputs, layer->inputs, from, layer->weight,
+                     into);
+            if (layer == head)
+                add_bias(head, some, into);
+            else
+                activate_only(layer, some, into, scratch);
+            from = into;
+        }
     }
 }
 

@@ -16,6 +16,7 @@ LEARNERS = pytest.mark.parametrize(
         ('gciql', {'actor_loss': 'bc'}),
         ('gciql', {'actor_loss': 'awr'}),
         ('gciql', {'actor_loss': 'ddpgbc'}),
+        ('saw', {}),
     ],
 )
 WIDE = {'hidden': (160, 144)}  # whose products with 160 rows go to oneDNN
@@ -95,7 +96,7 @@ def test_equal_critics_share_the_gradient_as_autograd_divides_it():
         assert relative_error(written, expected) < 2e-5
 
 
-@pytest.mark.parametrize('name', ['gcbc', 'gciql'])
+@pytest.mark.parametrize('name', ['gcbc', 'gciql', 'saw'])
 def test_learned_deviation_and_subclasses_have_none(name):
     class Other(GCBC):
         pass
@@ -125,6 +126,8 @@ def test_passes_equal_the_module(layer_norm, products, way, monkeypatch):
         upstream = torch.randn(rows, 3, generator=generator)
         outputs = mlp(inputs)
         torch.testing.assert_close(passes.forward(inputs.detach()), outputs.detach())
+        others = torch.randn(3 * rows, 5, generator=generator)  # keep nothing, leave what is kept
+        torch.testing.assert_close(passes.evaluate(others), mlp(others).detach())
         expected = torch.autograd.grad(outputs, [inputs, *mlp.parameters()], upstream)
         found = passes.backward(upstream.clone(), inputs=True)
         for own, reference in zip([found, *passes.gradients], expected, strict=True):

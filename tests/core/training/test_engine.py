@@ -67,7 +67,7 @@ def test_products_in_bfloat16_follow_float32(name, settings, actor_only, engine)
 
 
 @pytest.mark.parametrize('early_stopping', [False, True])
-@pytest.mark.parametrize('name', ['gcbc', 'gciql'])
+@pytest.mark.parametrize('name', ['gcbc', 'gciql', 'saw'])
 def test_adapt_draws_the_same_batches_for_both(name, early_stopping):
     dataset, agent = random_dataset([30, 30]), tiny_agent(name)
     results = [

@@ -50,7 +50,7 @@ def test_pretraining_leaves_the_given_agent_and_repeats(name):
     assert_changed(pretrain(agent, dataset, CONFIG, seed=2), weights_of(first))
 
 
-@pytest.mark.parametrize('name', ['gcbc', 'gciql'])
+@pytest.mark.parametrize('name', ['gcbc', 'gciql', 'saw'])
 def test_kernels_pretrain_as_autograd_does(name, monkeypatch):
     agent, dataset = tiny_agent(name), random_dataset()
     by_kernels = pretrain(agent, dataset, CONFIG)

@@ -16,7 +16,7 @@ def test_report_holds_every_learner_and_way(tmp_path, capsys):
     rows = json.loads(out.read_text())['results']['ms_per_step']
     assert len(rows) == 5 * 2
     for row in rows:
-        assert row['engine'] == ('eager' if row['agent'] == 'saw' else 'kernels')
+        assert row['engine'] == 'kernels'
         assert row['eager / auto'] > 0
         assert min(row[way] for way in ('bfloat16', 'early stopping', 'products')) > 0
     assert 'auto / products' in capsys.readouterr().out
