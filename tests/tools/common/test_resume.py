@@ -191,8 +191,7 @@ def test_second_writer_is_refused_while_the_first_lives(data, tmp_path, capsys):
 def test_policy_that_is_replaced_while_it_is_evaluated_is_refused(data, tmp_path):
     base = pretrained(data, tmp_path / 'base') / 'checkpoint'
     settings = evaluate.EvaluateSettings(checkpoints=(base,), dataset=data, episodes=1)
-    fingerprint = load_checkpoint(base).fingerprint()
-    evaluate._start_worker(settings, {str(base): fingerprint})
+    evaluate._start_worker(settings, evaluate.fingerprints(data, [base]))
     job = (str(base), 'pointmaze-medium-v0', 0, 0, 1)
     assert evaluate._success_rate(job) in (0, 1)
     other = load_checkpoint(pretrained(data, tmp_path / 'other', seed=1) / 'checkpoint')
