@@ -24,6 +24,7 @@ def test_finished_jobs_are_there_after_a_kill(tmp_path):
 
 def test_without_resume_nothing_finished_is_lost(tmp_path):
     path = tmp_path / 'jobs.jsonl'
+    JobLog(path, SETTINGS, resume=False)  # which ended before its first job
     JobLog(path, SETTINGS, resume=False).add(('base', 0), 0.25)
     with pytest.raises(ValueError, match='holds what an interrupted call finished: pass --resume'):
         JobLog(path, SETTINGS, resume=False)

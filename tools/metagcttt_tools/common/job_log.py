@@ -35,12 +35,14 @@ class JobLog(Generic[Job]):
         self._path = path
         self.finished: dict[Job, float] = {}
         if path.exists():
-            if not resume:
+            self.settings(path)  # or it is none of ours
+            if not resume and len(read_json_lines(path)) > 1:
                 raise ValueError(
                     f'{path}: holds what an interrupted call finished: pass --resume to continue, '
                     'remove it to start anew, or choose another --out'
                 )
-            self._read(settings)
+            if resume:
+                self._read(settings)
         lines: list[dict[str, Any]] = [{'settings': settings}]
         lines += [{'job': job, 'result': result} for job, result in self.finished.items()]
         write_text(path, ''.join(map(_line, lines)))  # whole, and without a line cut short
