@@ -1,11 +1,12 @@
 """Files and folders that are safe to write and to remove.
 
 Writes are atomic: a crash leaves the old content or the new, never a part. A folder is removed
-only if it carries our mark, so nothing that somebody else made is ever deleted.
+only if it carries our mark, results replace only results of ours, and no link is followed, so
+nothing that somebody else made is ever deleted.
 """
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 import json
 import os
 from pathlib import Path
@@ -13,7 +14,12 @@ import shutil
 import tempfile
 from typing import Any, IO
 
+PICTURE_MARK = 'metagcttt'
+"""The text in a PNG or GIF by which it is known as ours."""
+
 _MARK = '.made-by-metagcttt'
+_PICTURES = ('.png', '.gif')
+_PROVENANCE = {'commit', 'versions'}
 
 
 @contextmanager
@@ -21,7 +27,13 @@ def atomic_write(path: Path) -> Iterator[IO[bytes]]:
     """A binary file that replaces `path` when the block ends without an error.
 
     Missing folders are created. On any failure, `path` keeps its old content.
+
+    Raises:
+        FileExistsError: If `path` is a symbolic link: to replace it would be to lose it.
+        OSError: If it cannot be written; names it, also where the disk is full.
     """
+    if path.is_symlink():
+        raise FileExistsError(f'{path} is a symbolic link: move it elsewhere')
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
     try:
@@ -31,9 +43,26 @@ def atomic_write(path: Path) -> Iterator[IO[bytes]]:
             os.fsync(file.fileno())
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
+    except BaseException as error:
+        with suppress(FileNotFoundError):
+            os.unlink(temporary)
+        if isinstance(error, OSError) and error.errno and error.filename is None:
+            raise OSError(error.errno, error.strerror, str(path)) from error
         raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write text atomically."""
+    with atomic_write(path) as file:
+        file.write(text.encode())
+
+
+def in_words(error: OSError) -> str:
+    """The file and what is wrong with it, for a person to read."""
+    if error.filename is None or error.strerror is None:
+        return str(error)
+    reason = 'is no folder' if isinstance(error, FileExistsError) else error.strerror.lower()
+    return f'{error.filename}: {reason}'
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -71,6 +100,46 @@ def _object(place: Path | str, text: bytes) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ValueError(f'{place}: must hold a JSON object, got {type(content).__name__}')
     return content
+
+
+def not_through_links(path: str, flags: int) -> int:
+    """An `opener` for `open` that refuses a symbolic link."""
+    return os.open(path, flags | os.O_NOFOLLOW, 0o666)
+
+
+def refuse_foreign(record: Path, *others: Path) -> None:
+    """Refuse to write results where there are files of somebody else.
+
+    Args:
+        record: The file that says where the results come from: JSON with commit and versions.
+            A picture without one is known by its `PICTURE_MARK`.
+        others: What is written along with it; ours if the record is.
+
+    Raises:
+        FileExistsError: If one of them is there and not ours, or is a symbolic link; names it.
+    """
+    known = _is_ours(record)
+    for path in (record, *others):
+        if path.is_symlink() or (path.exists() and not (known or _is_ours(path))):
+            raise FileExistsError(
+                f'{path} exists and was not made by metagcttt: move it elsewhere, '
+                'or choose another place'
+            )
+
+
+def _is_ours(path: Path) -> bool:
+    if path.is_symlink() or not path.is_file():
+        return False
+    if path.suffix in _PICTURES:
+        return PICTURE_MARK.encode() in path.read_bytes()
+    try:
+        content = read_json(path)
+    except ValueError:
+        return False
+    study = content.get('study')
+    return content.keys() >= _PROVENANCE or (
+        isinstance(study, dict) and study.keys() >= _PROVENANCE
+    )
 
 
 def claim_folder(path: Path) -> None:

@@ -21,6 +21,9 @@ from metagcttt_core.files import atomic_write, read_json, write_json
 
 FORMAT_VERSION = 1
 _INDEX = 'checkpoint.json'
+_WEIGHTS = r'weights-[0-9a-f]{16}\.safetensors'
+_OURS = rf'{_WEIGHTS}|\.({_WEIGHTS}|checkpoint\.json)\.\w{{8}}'
+"""Files of weights, and what a writer leaves that is killed; others are not ours to remove."""
 _PRETRAINING = 'pretrain'  # the stage
 
 
@@ -60,7 +63,7 @@ class _Index(Settings):
     settings: dict[str, Any]
     metadata: dict[str, Any]
     scaling: dict[str, Any] | None = None
-    weights: str = Field(pattern=r'^weights-[0-9a-f]{16}\.safetensors$')
+    weights: str = Field(pattern=rf'^{_WEIGHTS}$')
     training: _Training | None = None
 
 
@@ -112,8 +115,8 @@ def save_checkpoint(agent: Agent, path: str | Path, training: TrainingState | No
     # Without a scaling, programs of before there was one can read it.
     unused = set() if index.scaling else {'scaling'}
     write_json(folder / _INDEX, index.model_dump(mode='json', exclude=unused))
-    for old in folder.glob('weights-*.safetensors'):
-        if old.name != weights:
+    for old in folder.iterdir():
+        if re.fullmatch(_OURS, old.name) and old.name != weights and not old.is_symlink():
             old.unlink()
 
 

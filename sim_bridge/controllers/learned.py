@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 import hashlib
 from itertools import pairwise
 from pathlib import Path
+import re
 from typing import Any, Literal, Self
 
 from metagcttt_core.files import atomic_write, write_json
@@ -16,6 +17,7 @@ from sim_bridge.controllers.follower import ControllerError
 from sim_bridge.simulator import Array
 
 _INDEX = 'controller.json'
+_WEIGHTS = re.compile(r'weights-[0-9a-f]{16}\.safetensors')
 
 
 class _Index(BaseModel):
@@ -123,8 +125,8 @@ class LearnedFollower:
         with atomic_write(folder / index.weights) as file:
             file.write(self._serialized())
         write_json(folder / _INDEX, index.model_dump())
-        for old in folder.glob('weights-*.safetensors'):
-            if old.name != index.weights:
+        for old in folder.iterdir():
+            if _WEIGHTS.fullmatch(old.name) and old.name != index.weights:
                 old.unlink()
 
     @classmethod

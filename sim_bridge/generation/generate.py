@@ -98,7 +98,7 @@ def generate(
         processes: Worker processes; 1 records in this process.
         resume: Continue what an earlier call for the same plan left; a complete dataset is left
             as it is.
-        overwrite: Discard what an earlier call left.
+        overwrite: Discard what an earlier call left; files that none made are kept.
         progress: Called as episodes finish.
         controller: Folder of the learned controller to use, for a robot that needs one; by
             default the bundled one.
@@ -107,8 +107,8 @@ def generate(
         Statistics of the dataset.
 
     Raises:
-        GenerationError: If the output exists and neither flag is given, if it was generated with
-            other settings, or if a worker process died.
+        GenerationError: If the output exists and neither flag is given, or no call of this made
+            it; if it was generated with other settings; if a worker process died.
         ControllerError: If the robot needs a controller and there is none.
     """
     if processes < 1:
@@ -117,13 +117,15 @@ def generate(
     paths = OutputPaths(output)
     folder = ChunkFolder(paths.partial)
     settings = _settings(plan, follower)
-    if overwrite:
-        folder.remove()
+    begun = folder.exists() or paths.sidecar.exists()
+    if overwrite and begun:
         if paths.sidecar.exists():
             _stored(paths.sidecar)  # or it is not ours to remove
-            paths.sidecar.unlink()
-    elif not resume:
-        _refuse_existing(paths)
+        folder.remove()
+        folder.open(settings)  # before the sidecar goes: whenever this dies, it is known as ours
+        paths.sidecar.unlink(missing_ok=True)
+    elif not (resume and begun):
+        _refuse_existing(paths, begun)
     elif paths.sidecar.exists():
         statistics = _finished(paths.sidecar, settings)
         folder.remove()
@@ -165,13 +167,18 @@ def _settings(plan: GenerationPlan, follower: DirectionFollower) -> dict[str, An
     return {'format_version': FORMAT_VERSION, **settings, **controller, **versions}
 
 
-def _refuse_existing(paths: OutputPaths) -> None:
+def _refuse_existing(paths: OutputPaths, begun: bool) -> None:
     if paths.partial.exists():
         raise GenerationError(
             f'{paths.partial} holds an unfinished dataset: resume it or overwrite it'
         )
     for path in (paths.train, paths.validation, paths.sidecar):
         if path.exists():
+            if not begun:
+                raise GenerationError(
+                    f'{path} exists and was not generated here ({paths.sidecar.name} is missing): '
+                    'move it or choose another output'
+                )
             raise GenerationError(f'{path} exists: overwrite it or choose another output')
 
 

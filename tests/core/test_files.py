@@ -1,8 +1,18 @@
 """Files are whole: the old content or the new, never a part."""
 
+import errno
 import json
+import os
 
-from metagcttt_core.files import atomic_write, claim_folder, remove_claimed, write_json
+from metagcttt_core.files import (
+    atomic_write,
+    claim_folder,
+    not_through_links,
+    PICTURE_MARK,
+    refuse_foreign,
+    remove_claimed,
+    write_json,
+)
 import pytest
 
 
@@ -86,3 +96,57 @@ def test_folder_of_somebody_else_is_neither_used_nor_removed(tmp_path):
     assert (theirs / 'thesis').read_text() == 'four years of work'
     assert file.read_text() == 'theirs too'
     assert {path.name for path in tmp_path.iterdir()} == {'theirs', 'ours', 'link', 'file'}
+
+
+def test_a_link_is_neither_followed_nor_replaced(tmp_path):
+    link, theirs = tmp_path / 'link.json', tmp_path / 'theirs.json'
+    theirs.write_text('{}')
+    link.symlink_to(theirs)
+    with pytest.raises(FileExistsError, match=r'link\.json is a symbolic link'):
+        write_json(link, {'ours': 1})
+    with pytest.raises(OSError, match=r'link\.json'), open(link, 'w', opener=not_through_links):
+        raise AssertionError('was opened')
+    assert (link.readlink(), theirs.read_text()) == (theirs, '{}')
+
+
+def test_a_full_disk_is_an_error_that_names_the_file(tmp_path):
+    with pytest.raises(OSError, match=r"No space left on device: '.*file'"):
+        with atomic_write(tmp_path / 'file'):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    'content',
+    ['{}', '[1]', 'four years of work', '{"settings": {"colour": "red"}}', '{"study": 1}'],
+)
+def test_results_of_somebody_else_are_kept(content, tmp_path):
+    record, table = tmp_path / 'run.json', tmp_path / 'run.md'
+    refuse_foreign(record, table)  # nothing there
+    record.write_text(content)
+    with pytest.raises(FileExistsError, match=r'run\.json exists and was not made by metagcttt'):
+        refuse_foreign(record, table)
+    record.unlink()
+    table.write_text(content)
+    with pytest.raises(FileExistsError, match=r'run\.md exists and was not made by metagcttt'):
+        refuse_foreign(record, table)
+
+
+@pytest.mark.parametrize('depth', [lambda made: made, lambda made: {'study': made}])
+def test_results_of_ours_are_known_by_their_record(depth, tmp_path):
+    record, table, link = tmp_path / 'run.json', tmp_path / 'run.md', tmp_path / 'link.md'
+    write_json(record, depth({'commit': 'abc', 'versions': {}, 'more': 1}))
+    table.write_text('| success |')
+    refuse_foreign(record, table)
+    link.symlink_to(table)
+    with pytest.raises(FileExistsError, match=r'link\.md exists'):
+        refuse_foreign(record, link)
+
+
+def test_a_picture_is_known_by_its_mark(tmp_path):
+    picture = tmp_path / 'run.png'
+    picture.write_bytes(b'holiday')
+    with pytest.raises(FileExistsError, match=r'run\.png exists'):
+        refuse_foreign(picture)
+    picture.write_bytes(PICTURE_MARK.encode())
+    refuse_foreign(picture)

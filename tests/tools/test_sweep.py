@@ -179,6 +179,57 @@ def test_curve_must_fit_the_snapshots(preset):
         study_of(preset, curve=[0.5, 0.75])
 
 
+@pytest.mark.parametrize(
+    ('different', 'message'),
+    [
+        ({'arms': {'base': {}}}, 'base-0: two runs would go there'),
+        ({'seeds': [0, 0]}, 'base-0: two runs would go there; seeds and names must differ'),
+        ({'arms': {'../theirs': {}}}, 'theirs-0: names of arms and adaptations must be plain'),
+        ({'adaptations': {'a/b': {}}}, 'b.json: names of arms and adaptations must be plain'),
+        (
+            {'arms': {'x': {'evaluate': {'episodes': 2}}}, 'adaptations': {'a': {}, 'a-x': {}}},
+            'adaptations: a-x is that of a for arm x',
+        ),
+    ],
+)
+def test_runs_that_would_share_a_place_are_refused(preset, different, message):
+    with pytest.raises(ValueError, match=message):
+        study_of(preset, **different)
+
+
+def test_names_with_points_have_presets_of_their_own(preset):
+    study = study_of(preset, arms={'lr0.5': {}, 'lr0.25': {}}, seeds=[0])
+    runs = [run for _, run in study.post_training]
+    study.settings.out.mkdir()
+    jobs = [*sweep._jobs('meta_train', runs), *sweep._jobs('evaluate', study._not_evaluated())]
+    assert [job.invocation.preset.name for job in jobs] == [
+        'lr0.5-0.yaml',
+        'lr0.25-0.yaml',
+        'evaluation-full.yaml',
+        'evaluation-slow.yaml',
+        'curve.yaml',
+    ]
+    assert [job.invocation.log.name for job in jobs[:2]] == ['lr0.5-0.log', 'lr0.25-0.log']
+
+
+def test_results_of_other_policies_are_put_aside_and_evaluated_anew(preset, monkeypatch):
+    study = study_of(preset)
+    evaluation, _ = study.evaluations['full']
+    evaluation.out.parent.mkdir()
+    report = {
+        'settings': evaluation.model_dump(mode='json'),
+        'fingerprints': {'dataset': 'd', 'policies': ['a', 'b']},
+    }
+    evaluation.out.write_text(json.dumps(report))
+    for policies, left in ((['a', 'b'], False), (['a', 'c'], True)):
+        now = {'dataset': 'd', 'policies': policies}
+        monkeypatch.setattr(sweep, 'fingerprints', lambda *_, now=now: now)
+        assert (evaluation in study._to_evaluate()) == left
+        assert evaluation.out.exists() != left
+    outdated = evaluation.out.with_name('evaluation-full.outdated.json')
+    assert json.loads(outdated.read_text()) == report
+
+
 def test_a_run_that_fails_ends_the_study_with_its_message(preset, capsys):
     values = yaml.safe_load(preset.read_text())
     values['pretrain']['dataset'] = 'missing.npz'

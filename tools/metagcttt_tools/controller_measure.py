@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from metagcttt_core.config import Settings
-from metagcttt_core.files import write_json
+from metagcttt_core.files import write_json, write_text
 import numpy as np
 from pydantic import Field
 from sim_bridge.controllers import HumanoidFollower, LearnedFollower, load_follower
@@ -24,8 +24,8 @@ from sim_bridge.mazes.ogbench_layouts import UNIT_M
 from tqdm import tqdm
 
 from metagcttt_tools.common.cli import fail, parse
-from metagcttt_tools.common.results import markdown_table
-from metagcttt_tools.common.session import provenance
+from metagcttt_tools.common.results import beside, markdown_table
+from metagcttt_tools.common.session import ours_or_fail, provenance, sole_writer
 from metagcttt_tools.controller.film import film
 
 _DESCRIPTION = """Measure how well a learned controller follows directions.
@@ -58,6 +58,14 @@ class MeasureSettings(Settings):
 def main(argv: list[str] | None = None) -> None:
     """Run the program."""
     settings = parse(MeasureSettings, _DESCRIPTION, 'controller measure', argv)
+    record, table, picture = (beside(settings.out, end) for end in ('.json', '.md', '.png'))
+    with sole_writer(record, record, table, picture):
+        if settings.gif is not None:
+            ours_or_fail(settings.gif)
+        _run(settings, record, table, picture)
+
+
+def _run(settings: MeasureSettings, record: Path, table: Path, picture: Path) -> None:
     from metagcttt_tools.common.plots import controller_picture, save
 
     try:
@@ -94,12 +102,12 @@ def main(argv: list[str] | None = None) -> None:
         **provenance(),
         **tables,
     }
-    write_json(settings.out.with_suffix('.json'), report)
+    write_json(record, report)
     text = format_tables(tables)
-    settings.out.with_suffix('.md').write_text(text, encoding='utf-8')
-    save(controller_picture(walks), settings.out.with_suffix('.png'))
+    write_text(table, text)
+    save(controller_picture(walks), picture)
     print(text)
-    print(f'results: {settings.out.with_suffix(".json")}, .md and .png')
+    print(f'results: {record}, .md and .png')
     if settings.gif is not None:
         film(follower, settings.gif, settings.seed)
         print(f'film: {settings.gif}')

@@ -19,6 +19,7 @@ from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.resume import nested, Resumable
 from metagcttt_tools.common.run_log import RunLog
 from metagcttt_tools.common.session import (
+    files_of_run,
     provenance,
     sole_writer,
     time_limit,
@@ -206,7 +207,7 @@ def main(argv: list[str] | None = None) -> None:
     settings = parse(TrainControllerSettings, _DESCRIPTION, 'controller train', argv)
     use_threads(settings.threads)
     try:
-        with sole_writer(settings.out):
+        with sole_writer(settings.out, *files_of_run(settings.out)):
             _run(settings)
     except ValueError as error:
         fail(str(error))

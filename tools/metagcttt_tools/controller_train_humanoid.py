@@ -9,7 +9,13 @@ from tqdm import tqdm
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.resume import Resumable
 from metagcttt_tools.common.run_log import RunLog
-from metagcttt_tools.common.session import sole_writer, time_limit, use_threads, write_settings
+from metagcttt_tools.common.session import (
+    files_of_run,
+    sole_writer,
+    time_limit,
+    use_threads,
+    write_settings,
+)
 from metagcttt_tools.common.stopping import stop_on_signal
 from metagcttt_tools.controller.recipe import HumanoidTask, STAGES_OF
 
@@ -42,7 +48,7 @@ def main(argv: list[str] | None = None) -> None:
     settings = parse(TrainHumanoidSettings, _DESCRIPTION, 'controller train-humanoid', argv)
     use_threads(settings.threads)
     try:
-        with sole_writer(settings.out):
+        with sole_writer(settings.out, *files_of_run(settings.out)):
             _run(settings)
     except ValueError as error:
         fail(str(error))

@@ -17,6 +17,7 @@ from pydantic import Field
 import tyro
 
 from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.session import sole_writer
 
 if TYPE_CHECKING:
     from metagcttt_core import Agent
@@ -52,8 +53,6 @@ def main(argv: list[str] | None = None) -> None:
     from metagcttt_core import save_checkpoint
     from metagcttt_core.training.checkpoint import has_checkpoint
 
-    if has_checkpoint(settings.out):
-        fail(f'{settings.out} holds a checkpoint: choose another --out')
     try:
         arrays = under_prefix(read_arrays(settings.file, []), settings.prefix)
         extra = settings.model_dump(include={'actor_loss', 'alpha'}, exclude_none=True)
@@ -66,7 +65,10 @@ def main(argv: list[str] | None = None) -> None:
         'environment': settings.environment,
         'history': [{'stage': 'converted', 'file': settings.file.name}],
     }
-    save_checkpoint(agent, settings.out)
+    with sole_writer(settings.out):
+        if has_checkpoint(settings.out):
+            fail(f'{settings.out} holds a checkpoint: choose another --out')
+        save_checkpoint(agent, settings.out)
     print(
         f'{agent.name}, {agent.obs_dim} observations, {agent.act_dim} actions, '
         f'{" x ".join(map(str, agent.settings.hidden))} units: {settings.out}'

@@ -9,7 +9,7 @@ from typing import Any, TYPE_CHECKING
 
 from metagcttt_core import TrajectoryDataset
 from metagcttt_core.config import assets_dir, Settings
-from metagcttt_core.files import write_json
+from metagcttt_core.files import refuse_foreign, write_json
 import numpy as np
 from pydantic import Field
 from sim_bridge import make_simulator
@@ -54,8 +54,9 @@ def main(argv: list[str] | None = None) -> None:
         if settings.view:
             drive_by_hand(settings)
             return
+        refuse_foreign(settings.out / 'summary.json', settings.out / 'demo.png')
         outcomes = run_arms(settings)
-    except (NodeFailedError, NoAnswerError, FileNotFoundError) as error:
+    except (NodeFailedError, NoAnswerError, FileNotFoundError, FileExistsError) as error:
         fail(str(error))
     except KeyboardInterrupt:
         raise SystemExit(130) from None

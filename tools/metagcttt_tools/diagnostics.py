@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from metagcttt_core.config import Settings
-from metagcttt_core.files import read_json_lines
+from metagcttt_core.files import read_json_lines, refuse_foreign
 import numpy as np
 from pydantic import Field
 
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.run_log import METRICS
+from metagcttt_tools.common.session import SETTINGS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -57,6 +58,12 @@ def main(argv: list[str] | None = None) -> None:
             print(f'warning: after step {line["step"]}: {warning}')
     last_step = records[-1]['step']
     out = settings.out or settings.run / 'diagnostics'
+    pictures = [out / f'{name}.png' for name in PICTURES]
+    try:
+        for path in pictures:
+            refuse_foreign(*([] if settings.out else [settings.run / SETTINGS]), path)
+    except FileExistsError as error:
+        fail(str(error))
     writer = SummaryWriter(str(settings.run / 'tensorboard')) if settings.tensorboard else None
     for name, picture in PICTURES.items():
         figure = picture(records)

@@ -14,8 +14,8 @@ from sim_bridge import make_simulator
 from tqdm import tqdm
 
 from metagcttt_tools.common.cli import fail, parse
-from metagcttt_tools.common.results import markdown_table, start_column, write_report
-from metagcttt_tools.common.session import use_threads
+from metagcttt_tools.common.results import beside, markdown_table, start_column, write_report
+from metagcttt_tools.common.session import sole_writer, use_threads
 
 if TYPE_CHECKING:
     from metagcttt_core.evaluation import Episode
@@ -49,13 +49,15 @@ def main(argv: list[str] | None = None) -> None:
     """Run the program."""
     settings = parse(DrawSettings, _DESCRIPTION, 'draw-episodes', argv)
     use_threads(1)
+    record, picture = beside(settings.out, '.json'), beside(settings.out, '.png')
     try:
-        _run(settings)
+        with sole_writer(record, record, picture):
+            _run(settings, record, picture)
     except ValueError as error:
         fail(str(error))
 
 
-def _run(settings: DrawSettings) -> None:
+def _run(settings: DrawSettings, record: Path, picture: Path) -> None:
     from metagcttt_core import load_checkpoint
     from metagcttt_core.evaluation import run_episode
 
@@ -98,10 +100,10 @@ def _run(settings: DrawSettings) -> None:
         for arm, episodes in arms.items()
         for episode in episodes
     ]
-    save(figure, settings.out.with_suffix('.png'))
-    write_report(settings.out.with_suffix('.json'), settings, {'episodes': rows})
+    write_report(record, settings, {'episodes': rows})
+    save(figure, picture)
     print(markdown_table(rows))
-    print(f'picture: {settings.out.with_suffix(".png")}')
+    print(f'picture: {picture}')
 
 
 def retrieved(

@@ -18,9 +18,9 @@ from metagcttt_core import (
 from metagcttt_core.adaptation import TTTSettings
 from metagcttt_core.agents.config import ActorLoss
 from metagcttt_core.config import Settings
-from metagcttt_core.files import write_json
+from metagcttt_core.files import read_json, write_json
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator
 from sim_bridge import make_simulator
 from sim_bridge.generation.workers import end_with_parent
 from tqdm import tqdm
@@ -29,7 +29,7 @@ from metagcttt_tools import evaluate_offline
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.job_log import JobLog
 from metagcttt_tools.common.results import markdown_table, start_column
-from metagcttt_tools.common.resume import Resumable
+from metagcttt_tools.common.resume import kept_in, Resumable
 from metagcttt_tools.common.session import provenance, sole_writer, use_threads
 
 _DESCRIPTION = """Success of policies by test-time training budget.
@@ -75,9 +75,19 @@ class ProtocolSettings(Resumable, EpisodeSettings):
     out: Path = Field(Path('out/evaluation.json'), description='file for the results')
 
     def kept(self) -> tuple[Path, Mapping[str, Any]] | None:
-        """The settings of an interrupted call, which its log of finished jobs begins with."""
+        """The settings of an interrupted call, which its log of finished jobs begins with.
+
+        Those of a finished one are with its results.
+        """
         log = finished_jobs(self.out)
-        return (log, JobLog.settings(log)['program']) if log.exists() else None
+        return (log, JobLog.settings(log)['program']) if log.exists() else kept_in(self.out)
+
+    @field_validator('out')
+    @classmethod
+    def _known_ending(cls, out: Path) -> Path:
+        if out.suffix != '.json':
+            raise ValueError(f'must end in .json, got {out.name}')
+        return out
 
 
 class EvaluateSettings(ProtocolSettings):
@@ -96,20 +106,26 @@ def main(argv: list[str] | None = None) -> None:
         return
     settings = parse(EvaluateSettings, _DESCRIPTION, 'evaluate', arguments)
     try:
-        with sole_writer(settings.out):
-            results = evaluate(settings, settings)
+        with sole_writer(settings.out, settings.out):
+            marks = fingerprints(settings.dataset, settings.checkpoints)
+            done = finished_before(settings, marks)
+            results = done['results'] if done else evaluate(settings, settings, marks)
+            if not done:
+                report = {'settings': settings.model_dump(mode='json'), **provenance()}
+                write_json(settings.out, {**report, 'fingerprints': marks, 'results': results})
+                finished_jobs(settings.out).unlink()
     except ValueError as error:
         fail(str(error))
     except KeyboardInterrupt:
         print('interrupted; pass --resume to continue', file=sys.stderr)
         raise SystemExit(130) from None
-    report = {'settings': settings.model_dump(mode='json'), **provenance(), 'results': results}
-    write_json(settings.out, report)
     print(format_table(results, settings.standing))
     print(f'results: {settings.out}')
 
 
-def evaluate(settings: EvaluateSettings, program: Resumable) -> list[dict[str, Any]]:
+def evaluate(
+    settings: EvaluateSettings, program: Resumable, fingerprints: Mapping[str, Any]
+) -> list[dict[str, Any]]:
     """Success by policy and budget: rates per seed, their mean and error, and the AUC.
 
     Each point says, too, which share of the experts was accepted.
@@ -117,6 +133,11 @@ def evaluate(settings: EvaluateSettings, program: Resumable) -> list[dict[str, A
     Args:
         settings: What to evaluate.
         program: The settings to continue with after an interruption.
+        fingerprints: Of the data and policies, see `fingerprints`; what finishes is kept in
+            `finished_jobs` until the caller has kept the results.
+
+    Raises:
+        ValueError: If data or policies are not those of the fingerprints.
     """
     environments = [environment_of(path) for path in settings.checkpoints]
     num_tasks = make_simulator(environments[0], standing=settings.standing).spec.num_tasks
@@ -127,7 +148,7 @@ def evaluate(settings: EvaluateSettings, program: Resumable) -> list[dict[str, A
         for seed in settings.seeds
         for task in range(1, num_tasks + 1)
     ]
-    outcomes = _run_jobs(settings, program, jobs)
+    outcomes = _run_jobs(settings, program, jobs, fingerprints)
     results = []
     for path, environment in zip(settings.checkpoints, environments, strict=True):
         curve = []
@@ -192,8 +213,46 @@ def finished_jobs(out: Path) -> Path:
     return out.with_suffix('.partial.jsonl')
 
 
+def fingerprints(dataset: Path, checkpoints: Sequence[Path]) -> dict[str, Any]:
+    """Hashes of the dataset and of the policies."""
+    from metagcttt_core import load_checkpoint
+
+    policies = [load_checkpoint(path).fingerprint() for path in checkpoints]
+    return {'dataset': TrajectoryDataset.load(dataset).fingerprint, 'policies': policies}
+
+
+def finished_before(
+    program: ProtocolSettings, fingerprints: Mapping[str, Any]
+) -> dict[str, Any] | None:
+    """The report of a finished call that is asked to go on; None where something is left to do.
+
+    Raises:
+        ValueError: If it is of other data or policies.
+    """
+    out = program.out
+    if not program.resume or finished_jobs(out).exists() or not out.exists():
+        return None
+    report = read_json(out)
+    check_fingerprints(out, report, fingerprints)
+    return report
+
+
+def check_fingerprints(file: Path, report: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Refuse results of other data or policies than those that are there now.
+
+    Raises:
+        ValueError: If one differs; names the file, and what differs.
+    """
+    for name, was in report.get('fingerprints', {}).items():
+        if was != now.get(name):
+            raise ValueError(f'{file}: is of other {name}, was {was!r} and is now {now[name]!r}')
+
+
 def _run_jobs(
-    settings: EvaluateSettings, program: Resumable, jobs: list[Job]
+    settings: EvaluateSettings,
+    program: Resumable,
+    jobs: list[Job],
+    fingerprints: Mapping[str, Any],
 ) -> dict[Job, tuple[float, float]]:
     """The outcome of every job; jobs run in separate processes and are kept as they finish."""
     from metagcttt_core import load_checkpoint
@@ -203,20 +262,19 @@ def _run_jobs(
     if settings.ttt.optimizer_state == 'pretrained':
         for policy in policies:
             pretrained_state(policy)  # refuses those without one before anything runs
-    decisive = settings.decisive()
-    decisive['dataset'] = TrajectoryDataset.load(settings.dataset).fingerprint
-    fingerprints = [policy.fingerprint() for policy in policies]
-    decisive['policies'] = fingerprints
     log: JobLog[Job] = JobLog(
         finished_jobs(settings.out),
-        {'decisive': decisive, 'program': program.model_dump(mode='json')},
+        {
+            'decisive': {**settings.decisive(), **fingerprints},
+            'program': program.model_dump(mode='json'),
+        },
         resume=settings.resume,
     )
     pool = ProcessPoolExecutor(
         settings.processes,
         mp_context=multiprocessing.get_context('spawn'),
         initializer=_start_worker,
-        initargs=(settings, dict(zip(map(str, settings.checkpoints), fingerprints, strict=True))),
+        initargs=(settings, fingerprints),
     )
     todo = [job for job in jobs if job not in log.finished]
     with tqdm(total=len(jobs), initial=len(jobs) - len(todo), unit='job', desc='evaluate') as bar:
@@ -231,7 +289,7 @@ def _run_jobs(
             ) from error
         finally:
             pool.shutdown(cancel_futures=True)
-    log.remove()
+    log.close()
     return log.finished
 
 
@@ -253,18 +311,20 @@ class _Worker:
     """State that a worker process loads once."""
 
     settings: EvaluateSettings
-    fingerprints: Mapping[str, str]
+    fingerprints: Mapping[str, str]  # of the policies, by path
+    outdated: bool
     trajectory_filter: TrajectoryFilter
 
 
-def _start_worker(settings: EvaluateSettings, fingerprints: Mapping[str, str]) -> None:
+def _start_worker(settings: EvaluateSettings, fingerprints: Mapping[str, Any]) -> None:
     end_with_parent()
     use_threads(1)
     _Worker.settings = settings
-    _Worker.fingerprints = fingerprints
-    _Worker.trajectory_filter = TrajectoryFilter(
-        TrajectoryDataset.load(settings.dataset), settings.filter
-    )
+    paths = map(str, settings.checkpoints)
+    _Worker.fingerprints = dict(zip(paths, fingerprints['policies'], strict=True))
+    dataset = TrajectoryDataset.load(settings.dataset)
+    _Worker.outdated = dataset.fingerprint != fingerprints['dataset']
+    _Worker.trajectory_filter = TrajectoryFilter(dataset, settings.filter)
 
 
 def _outcome(job: Job) -> tuple[float, float]:
@@ -276,6 +336,8 @@ def _outcome(job: Job) -> tuple[float, float]:
     policy = load_checkpoint(path, environment=environment, changes=changes)
     if policy.fingerprint() != _Worker.fingerprints[path]:
         raise CheckpointError(f'{path}: was replaced while it was evaluated')
+    if _Worker.outdated:
+        raise ValueError(f'{_Worker.settings.dataset}: was replaced during the evaluation')
     simulator = make_simulator(environment, standing=_Worker.settings.standing)
     result = evaluate_success(
         policy,

@@ -115,7 +115,8 @@ def main(argv: list[str] | None = None) -> None:
     from metagcttt_tools.common import offline_plots, plots
 
     try:
-        with sole_writer(settings.out):
+        picture = settings.out.with_suffix('.png')
+        with sole_writer(settings.out, settings.out, picture):
             known = [read_success(path) for path in settings.against]
             source, train, held_out = split(settings)
             queries = draw_queries(
@@ -126,22 +127,26 @@ def main(argv: list[str] | None = None) -> None:
                 settings.seed,
             )
             print(f'{len(queries)} queries from {source}')
-            outcomes = run(settings, train, held_out, queries)
+            results = summarise(settings, run(settings, train, held_out, queries))
+            report = {
+                'settings': settings.model_dump(mode='json'),
+                **provenance(),
+                'held_out': source,
+                'results': results,
+            }
+            if known:
+                success = {k: v for each in known for k, v in each.items()}
+                report['against'] = correlation(results, success)
+            write_json(settings.out, report)
+            plots.save(offline_plots.offline_picture(results), picture)
     except ValueError as error:
         fail(str(error))
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)
         raise SystemExit(130) from None
-    results = summarise(settings, outcomes)
-    report = {'settings': settings.model_dump(mode='json'), **provenance(), 'held_out': source}
-    report['results'] = results
     print(format_table(results, settings.grid))
     if known:
-        report['against'] = correlation(results, {k: v for each in known for k, v in each.items()})
         print(describe_correlation(report['against']))
-    write_json(settings.out, report)
-    picture = settings.out.with_suffix('.png')
-    plots.save(offline_plots.offline_picture(results), picture)
     print(f'results: {settings.out}, picture: {picture}')
 
 

@@ -14,10 +14,12 @@ from pydantic import Field, model_validator
 from sim_bridge import make_simulator
 
 from metagcttt_tools.common.cli import fail, parse
-from metagcttt_tools.common.session import provenance
+from metagcttt_tools.common.session import provenance, sole_writer
 from metagcttt_tools.evaluate import (
+    check_fingerprints,
     environment_of,
     EpisodeSettings,
+    fingerprints,
     format_table,
     success_curve,
     success_point,
@@ -90,13 +92,20 @@ def main(argv: list[str] | None = None) -> None:
     from metagcttt_tools.graph.process import NodeFailedError
 
     try:
-        results = evaluate_ros(settings)
+        with sole_writer(settings.out, settings.out):
+            before = fingerprints(settings.dataset, settings.checkpoints)
+            results = evaluate_ros(settings)
+            check_fingerprints(
+                settings.checkpoints[0],
+                {'fingerprints': before},
+                fingerprints(settings.dataset, settings.checkpoints),
+            )
+            report = {'settings': settings.model_dump(mode='json'), **provenance()}
+            write_json(settings.out, {**report, 'fingerprints': before, 'results': results})
     except (NodeFailedError, NoAnswerError, ValueError) as error:
         fail(str(error))
     except KeyboardInterrupt:
         raise SystemExit(130) from None
-    report = {'settings': settings.model_dump(mode='json'), **provenance(), 'results': results}
-    write_json(settings.out, report)
     print(format_table(results, settings.standing))
     print('median adaptation, filter and inner loop (ms):')
     for result in results:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 import shutil
 import tempfile
@@ -17,6 +18,7 @@ from pydantic import Field
 import tyro
 
 from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.session import sole_writer
 
 _DESCRIPTION = """Write a dataset as a LeRobotDataset v3 (parquet files).
 
@@ -46,9 +48,8 @@ def main(argv: list[str] | None = None) -> None:
     """Run the program."""
     settings = parse(ExportSettings, _DESCRIPTION, 'export-lerobot', argv)
     from metagcttt_tools.common.names import names_of
-    from metagcttt_tools.tables.lerobot_writer import write_lerobot
 
-    if settings.out.exists():
+    if os.path.lexists(settings.out):
         fail(f'{settings.out} exists: give another --out')
     try:
         dataset = TrajectoryDataset.load(settings.data)
@@ -59,7 +60,22 @@ def main(argv: list[str] | None = None) -> None:
     except DatasetError as error:
         fail(str(error))
     fps = settings.fps or _rate(contract)
-    settings.out.parent.mkdir(parents=True, exist_ok=True)
+    with sole_writer(settings.out):
+        _write(settings, dataset, contract, fps, observed, commanded)
+    print(f'{dataset}: {settings.out}')
+    print(f'  {fps} frames a second; actions {"in units of the robot" if contract else "-1 to 1"}')
+
+
+def _write(
+    settings: ExportSettings,
+    dataset: TrajectoryDataset,
+    contract: Contract | None,
+    fps: int,
+    observed: list[str],
+    commanded: list[str],
+) -> None:
+    from metagcttt_tools.tables.lerobot_writer import write_lerobot
+
     # Whole or not at all: the folder gets its name when all is in it.
     part = Path(tempfile.mkdtemp(dir=settings.out.parent, prefix=f'.{settings.out.name}.'))
     try:
@@ -79,8 +95,6 @@ def main(argv: list[str] | None = None) -> None:
     except BaseException:
         shutil.rmtree(part)
         raise
-    print(f'{dataset}: {settings.out}')
-    print(f'  {fps} frames a second; actions {"in units of the robot" if contract else "-1 to 1"}')
 
 
 def _rate(contract: Contract | None) -> int:

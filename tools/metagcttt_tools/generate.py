@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.resume import Resumable
-from metagcttt_tools.common.session import sole_writer
+from metagcttt_tools.common.session import ours_or_fail, sole_writer
 
 DESCRIPTION = """Generate an offline dataset of a maze in OGBench's npz format.
 
@@ -140,6 +140,9 @@ def _run(settings: GenerateSettings) -> None:
         standing=settings.standing,
     )
     output = settings.file
+    picture = output.with_suffix('.png')
+    if not OutputPaths(output).sidecar.exists():
+        ours_or_fail(picture)
     with tqdm(unit=' episodes', desc=output.stem, delay=0.5) as bar:
 
         def show(done: int, total: int) -> None:
@@ -155,7 +158,6 @@ def _run(settings: GenerateSettings) -> None:
             progress=show,
             controller=settings.controller,
         )
-    picture = output.with_suffix('.png')
     _draw(plan.environment, output, picture)
     print(f'wrote     {output} and {OutputPaths(output).validation.name}')
     print(f'episodes  {plan.episodes} + {plan.validation_episodes} for validation')

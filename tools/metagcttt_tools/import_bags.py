@@ -10,6 +10,7 @@ from metagcttt_core.robot import ContractError, load_contract
 from pydantic import Field
 
 from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.session import writes_dataset
 
 _DESCRIPTION = """Turn bags of a robot into a dataset (.npz), by its contract.
 
@@ -33,13 +34,16 @@ class BagSettings(Settings):
 def main(argv: list[str] | None = None) -> None:
     """Run the program."""
     settings = parse(BagSettings, _DESCRIPTION, 'import-bags', argv)
+    with writes_dataset(settings.out, settings.overwrite):
+        _run(settings)
+
+
+def _run(settings: BagSettings) -> None:
     from metagcttt_tools.recordings.trajectories import join_datasets
     from metagcttt_tools.robots.bag import open_bag
     from metagcttt_tools.robots.episodes import read_episodes
     from metagcttt_tools.robots.report import bag_faults, describe_bag
 
-    if settings.out.exists() and not settings.overwrite:
-        fail(f'{settings.out} exists: give --overwrite or another --out')
     if not settings.bags:
         fail('no bags were given: --bags FILE...')
     datasets = []

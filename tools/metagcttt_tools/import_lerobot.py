@@ -13,6 +13,7 @@ from pydantic import Field
 import tyro
 
 from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.session import writes_dataset
 
 _DESCRIPTION = """Turn a LeRobotDataset v3 (parquet files) into a dataset (.npz).
 
@@ -48,11 +49,14 @@ class LeRobotSettings(Settings):
 def main(argv: list[str] | None = None) -> None:
     """Run the program."""
     settings = parse(LeRobotSettings, _DESCRIPTION, 'import-lerobot', argv)
+    with writes_dataset(settings.out, settings.overwrite):
+        _run(settings)
+
+
+def _run(settings: LeRobotSettings) -> None:
     from metagcttt_tools.tables.columns import load_columns, map_of_contract
     from metagcttt_tools.tables.lerobot import ACTION, DEFAULT_MAP, read_lerobot, STATE
 
-    if settings.out.exists() and not settings.overwrite:
-        fail(f'{settings.out} exists: give --overwrite or another --out')
     if settings.columns and settings.contract:
         fail('give columns or contract, not both')
     try:

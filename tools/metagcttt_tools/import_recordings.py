@@ -11,6 +11,7 @@ from metagcttt_core.data import DatasetError
 from pydantic import Field
 
 from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.session import writes_dataset
 
 if TYPE_CHECKING:
     from metagcttt_tools.recordings.trajectories import RecordingSummary
@@ -40,10 +41,13 @@ class RecordingSettings(Settings):
 def main(argv: list[str] | None = None) -> None:
     """Run the program."""
     settings = parse(RecordingSettings, _DESCRIPTION, 'import-recordings', argv)
+    with writes_dataset(settings.out, settings.overwrite):
+        _run(settings)
+
+
+def _run(settings: RecordingSettings) -> None:
     from metagcttt_tools.recordings.trajectories import join_datasets, read_recordings
 
-    if settings.out.exists() and not settings.overwrite:
-        fail(f'{settings.out} exists: give --overwrite or another --out')
     try:
         dataset, summary = read_recordings(
             settings.recordings, keep_idle=settings.keep_idle, refuse_gaps=settings.refuse_gaps

@@ -10,6 +10,7 @@ from metagcttt_core.data import DatasetError
 from pydantic import Field
 
 from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.session import writes_dataset
 
 _DESCRIPTION = """Turn CSV or parquet files into a dataset (.npz), by a column map (YAML).
 
@@ -37,11 +38,14 @@ class TableSettings(Settings):
 def main(argv: list[str] | None = None) -> None:
     """Run the program."""
     settings = parse(TableSettings, _DESCRIPTION, 'import-table', argv)
+    with writes_dataset(settings.out, settings.overwrite):
+        _run(settings)
+
+
+def _run(settings: TableSettings) -> None:
     from metagcttt_tools.tables.columns import load_columns
     from metagcttt_tools.tables.rows import read_tables
 
-    if settings.out.exists() and not settings.overwrite:
-        fail(f'{settings.out} exists: give --overwrite or another --out')
     if not settings.tables:
         fail('no tables were given: --tables FILE...')
     try:

@@ -11,6 +11,7 @@ from metagcttt_core.config import Settings
 from metagcttt_core.config.yaml_file import SettingsFileError
 from metagcttt_core.data import DatasetError
 from metagcttt_core.data.inspection import Column, inspect, Inspection, Pace
+from metagcttt_core.files import refuse_foreign
 from metagcttt_core.robot import Contract, ContractError, load_contract
 import numpy as np
 from pydantic import Field
@@ -66,11 +67,12 @@ def main(argv: list[str] | None = None) -> None:
     from metagcttt_tools.common import plots
 
     try:
+        refuse_foreign(settings.out)
         opened = open_data(settings)
         found = inspect(opened.dataset)
     except (ContractError, SettingsFileError) as error:
         fail(*str(error).splitlines())
-    except DatasetError as error:
+    except (DatasetError, FileExistsError) as error:
         fail(str(error))
     x, y = settings.coverage
     width = opened.dataset.obs_dim

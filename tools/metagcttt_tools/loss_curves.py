@@ -10,7 +10,7 @@ from metagcttt_core import FilterConfig, TrajectoryDataset, TrajectoryFilter, TT
 from metagcttt_core.adaptation.config import TTTLoopConfig
 from metagcttt_core.agents.config import ActorLoss
 from metagcttt_core.config import Settings
-from metagcttt_core.files import read_json_lines
+from metagcttt_core.files import read_json_lines, refuse_foreign
 from metagcttt_core.retrieval.support import SupportSet
 import numpy as np
 from pydantic import Field
@@ -71,7 +71,9 @@ def main(argv: list[str] | None = None) -> None:
     from metagcttt_tools.common.plots import save
 
     use_threads(1)
+    picture = settings.out.with_suffix('.png')
     try:
+        refuse_foreign(settings.out, picture)
         if settings.run is not None:
             steps, curves = pretraining_curves(settings.run)
             axis = 'pre-training steps'
@@ -82,7 +84,6 @@ def main(argv: list[str] | None = None) -> None:
         fail(str(error))
     rows = roughness_rows(curves)
     write_report(settings.out, settings, {'steps': steps, 'losses': curves, 'roughness': rows})
-    picture = settings.out.with_suffix('.png')
     save(loss_picture(steps, curves, axis), picture)
     print('Roughness: mean change from step to step over the range of the curve\n')
     print(markdown_table(rows))

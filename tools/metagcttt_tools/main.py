@@ -9,6 +9,7 @@ import re
 import sys
 from typing import Annotated, Any, NamedTuple
 
+from metagcttt_core.files import in_words
 from pydantic import create_model
 import tyro
 
@@ -143,6 +144,8 @@ def _run(program: Program, arguments: list[str]) -> None:
         if missing in _ROS:
             fail(f'this takes ROS 2 and the workspace ({missing} is missing): make setup')
         raise
+    except OSError as error:  # names the file: one that is missing, unreadable or on a full disk
+        fail(in_words(error))
 
 
 def _every_flag(programs: Mapping[str, Program | Group]) -> Any:

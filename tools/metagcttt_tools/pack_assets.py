@@ -18,6 +18,8 @@ Checkpoints lose their optimiser state, which is twice as large as the weights, 
 precision (1.6 cm at 20 m) and without the simulator's own state, to be small enough for a
 repository."""
 
+_DATASET = 'dataset.npz'
+
 
 class PackSettings(Settings):
     """Settings of the program."""
@@ -38,14 +40,19 @@ def main(argv: list[str] | None = None) -> None:
     """Run the program."""
     settings = parse(PackSettings, _DESCRIPTION, 'pack-assets', argv)
     from metagcttt_core import CheckpointError, load_checkpoint, save_checkpoint
+    from metagcttt_core.training.checkpoint import has_checkpoint
 
     try:
-        for name in ('base', 'meta'):
-            agent = load_checkpoint(getattr(settings, name))
+        agents = {name: load_checkpoint(getattr(settings, name)) for name in ('base', 'meta')}
+        dataset = TrajectoryDataset.load(settings.dataset)
+        packed = settings.out / _DATASET
+        if packed.exists() and not has_checkpoint(settings.out / 'base'):
+            fail(f'{packed} exists and was not packed here: choose another --out')
+        for name, agent in agents.items():
             if not settings.optimizer_state:
                 agent.optimizer_state = None
             save_checkpoint(agent, settings.out / name)
-        pack_dataset(TrajectoryDataset.load(settings.dataset), settings)
+        pack_dataset(dataset, settings)
     except (DatasetError, CheckpointError) as error:
         fail(str(error))
     for path in sorted(settings.out.rglob('*')):
@@ -56,7 +63,7 @@ def main(argv: list[str] | None = None) -> None:
 def pack_dataset(dataset: TrajectoryDataset, settings: PackSettings) -> None:
     """Write the first trajectories of `dataset` to `dataset.npz`."""
     rows = int(dataset.episode_ends[min(settings.episodes, dataset.num_episodes) - 1]) + 1
-    with atomic_write(settings.out / 'dataset.npz') as file:
+    with atomic_write(settings.out / _DATASET) as file:
         np.savez_compressed(
             file,
             observations=dataset.observations[:rows].astype(np.float16),

@@ -14,7 +14,7 @@ from metagcttt_core.evaluation import (
     probability_of_improvement,
     stratified_bootstrap,
 )
-from metagcttt_core.files import read_json, write_json
+from metagcttt_core.files import read_json, write_json, write_text
 import numpy as np
 from pydantic import Field, ValidationError
 import tyro
@@ -23,7 +23,8 @@ from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.differences import differences
 from metagcttt_tools.common.evidence import format_evidence, read_evidence
 from metagcttt_tools.common.manifest import BASE, Evaluation, FILE, Manifest, Policy
-from metagcttt_tools.common.results import markdown_table, Point, Results
+from metagcttt_tools.common.results import beside, markdown_table, Point, Results
+from metagcttt_tools.common.session import sole_writer
 
 _DESCRIPTION = """Tables and figures of a study that metagcttt sweep ran.
 
@@ -76,9 +77,11 @@ def main(argv: list[str] | None = None) -> None:
     except ValueError as error:
         fail(str(error))
     out = settings.out or settings.study / 'report'
-    out.parent.mkdir(parents=True, exist_ok=True)
-    write_json(out.with_suffix('.json'), report)
-    print(_write_tables_and_figures(report, out))
+    record = beside(out, '.json')
+    others = [beside(out, ending) for ending in ('.md', '.png', '-iqm.png', '-curve.png')]
+    with sole_writer(record, record, *others):
+        write_json(record, report)
+        print(_write_tables_and_figures(report, out))
 
 
 def rebuild(folder: Path) -> str:
@@ -95,9 +98,9 @@ def rebuild(folder: Path) -> str:
                 arm: {float(fraction): point for fraction, point in points.items()}
                 for arm, points in results['curve'].items()
             }
-            _write_tables_and_figures(results, (folder / name).with_suffix(''))
+            _write_tables_and_figures(results, folder / name.removesuffix('.json'))
     page = format_evidence(evidence)
-    (folder / 'paper.md').write_text(page, encoding='utf-8')
+    write_text(folder / 'paper.md', page)
     return page
 
 
@@ -111,17 +114,17 @@ def _write_tables_and_figures(report: dict[str, Any], out: Path) -> str:
     )
 
     text = format_report(report)
-    out.with_suffix('.md').write_text(text, encoding='utf-8')
-    save(success_curves(_panels(report['adaptations'])), out.with_suffix('.png'))
+    write_text(beside(out, '.md'), text)
+    save(success_curves(_panels(report['adaptations'])), beside(out, '.png'))
     robust = {
         name: arms
         for name, arms in report['adaptations'].items()
         if any('robust' in arm for arm in arms.values())
     }
     if robust:
-        save(interquartile_picture(_panels(robust)), out.with_name(f'{out.name}-iqm.png'))
+        save(interquartile_picture(_panels(robust)), beside(out, '-iqm.png'))
     if report['curve']:
-        save(post_training_curves(report['curve']), out.with_name(f'{out.name}-curve.png'))
+        save(post_training_curves(report['curve']), beside(out, '-curve.png'))
     return text
 
 

@@ -17,6 +17,9 @@ from metagcttt_tools.common.session import snapshot_folder, SNAPSHOTS, sole_writ
 from metagcttt_tools.evaluate import (
     evaluate,
     EvaluateSettings,
+    fingerprints,
+    finished_before,
+    finished_jobs,
     ProtocolSettings,
 )
 
@@ -56,19 +59,32 @@ def main(argv: list[str] | None = None) -> None:
             ),
             **settings.model_dump(exclude={'runs'}),
         )
-        with sole_writer(settings.out):
-            results = evaluate(evaluation, settings)
+        picture = settings.out.with_suffix('.png')
+        with sole_writer(settings.out, settings.out, picture):
+            marks = fingerprints(evaluation.dataset, evaluation.checkpoints)
+            done = finished_before(settings, marks)
+            rows = done['results']['curve'] if done else _rows(evaluation, settings, steps, marks)
+            if not done:
+                write_report(settings.out, settings, {'curve': rows}, marks)
+                finished_jobs(settings.out).unlink()
+            save(curve_picture(rows), picture)
     except ValueError as error:
         fail(str(error))
     except KeyboardInterrupt:
         print('interrupted; pass --resume to continue', file=sys.stderr)
         raise SystemExit(130) from None
-    rows = [{**row, **start_column(settings.standing)} for row in curve_rows(results, steps)]
-    write_report(settings.out, settings, {'curve': rows})
-    picture = settings.out.with_suffix('.png')
-    save(curve_picture(rows), picture)
     print(markdown_table(rows))
     print(f'results: {settings.out}\npicture: {picture}')
+
+
+def _rows(
+    evaluation: EvaluateSettings,
+    settings: SuccessCurveSettings,
+    steps: list[int],
+    fingerprints: dict[str, Any],
+) -> list[dict[str, Any]]:
+    results = evaluate(evaluation, settings, fingerprints)
+    return [{**row, **start_column(settings.standing)} for row in curve_rows(results, steps)]
 
 
 def common_steps(runs: Sequence[Path]) -> list[int]:

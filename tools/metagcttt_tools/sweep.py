@@ -12,14 +12,14 @@ from typing import Annotated, Any
 from metagcttt_core import MetaConfig
 from metagcttt_core.agents.config import ActorLoss
 from metagcttt_core.config import error_lines, Settings
-from metagcttt_core.files import read_json
+from metagcttt_core.files import read_json, write_text
 from pydantic import Field, model_validator, ValidationError
 import tyro
 import yaml
 
 from metagcttt_tools.common.cli import fail, merged, parse, preset_values
 from metagcttt_tools.common.estimate import format_estimate
-from metagcttt_tools.common.manifest import BASE, checkpoints, Evaluation, Manifest, Policy
+from metagcttt_tools.common.manifest import BASE, checkpoints, Evaluation, FILE, Manifest, Policy
 from metagcttt_tools.common.run_log import last_step
 from metagcttt_tools.common.session import (
     provenance,
@@ -30,7 +30,7 @@ from metagcttt_tools.common.session import (
     use_threads,
 )
 from metagcttt_tools.common.stopping import stop_on_signal
-from metagcttt_tools.evaluate import EvaluateSettings
+from metagcttt_tools.evaluate import EvaluateSettings, fingerprints, finished_jobs
 from metagcttt_tools.jobs.program import Invocation
 from metagcttt_tools.jobs.scheduler import Job, LocalScheduler, Resources, run_all, Scheduler
 from metagcttt_tools.meta_train import MetaTrainSettings
@@ -115,7 +115,7 @@ def main(argv: list[str] | None = None) -> None:
             use_threads(1)
             print(study.estimate())
             return
-        with sole_writer(settings.out):
+        with sole_writer(settings.out, settings.out / FILE):
             study.run()
     except ValueError as error:
         fail(str(error))
@@ -147,6 +147,8 @@ class Study:
             )
             for arm in filter(self._is_alone, settings.arms):
                 own = merged(settings.arms[arm].evaluate, different)
+                if f'{name}-{arm}' in settings.adaptations:
+                    raise ValueError(f'adaptations: {name}-{arm} is that of {name} for arm {arm}')
                 self.evaluations[f'{name}-{arm}'] = self._evaluation(
                     f'evaluation-{name}-{arm}', [*base, *self._trained(arm)], own
                 )
@@ -161,6 +163,20 @@ class Study:
             budgets = {'budgets': settings.curve_budgets}
             self.curve = self._evaluation('curve', along, budgets)
             self._check_curve_budgets()
+        self._check_names()
+
+    def _check_names(self) -> None:
+        """Each run has a place of its own, in the folder of the study."""
+        runs = [*self.pretraining, *(run for _, run in self.post_training)]
+        evaluations = [*self.evaluations.values(), *([self.curve] if self.curve else [])]
+        taken: set[str] = set()
+        for out in (*(run.out for run in runs), *(run.out for run, _ in evaluations)):
+            name = out.name.removesuffix('.json')
+            if out.parent != self.settings.out or name.startswith('.'):
+                raise ValueError(f'{out}: names of arms and adaptations must be plain names')
+            if name in taken:
+                raise ValueError(f'{out}: two runs would go there; seeds and names must differ')
+            taken.add(name)
 
     def _check_curve_budgets(self) -> None:
         """The curve ends with the policies that every adaptation evaluates."""
@@ -184,9 +200,10 @@ class Study:
                 for tool, runs in (
                     ('pretrain', self.pretraining),
                     ('meta_train', [run for _, run in self.post_training]),
-                    ('evaluate', self._not_evaluated()),
+                    ('evaluate', None),
                 ):
-                    run_all(tool, _jobs(tool, runs), scheduler, stop)
+                    left = self._to_evaluate() if runs is None else runs
+                    run_all(tool, _jobs(tool, left), scheduler, stop)
             except KeyboardInterrupt:
                 print('interrupted; run the same command to continue', file=sys.stderr)
                 raise SystemExit(stop.status) from None
@@ -210,7 +227,15 @@ class Study:
 
     def _not_evaluated(self) -> list[EvaluateSettings]:
         planned = [*self.evaluations.values(), *([self.curve] if self.curve else [])]
-        return [run for run, _ in planned if not is_evaluated(run)]
+        return [run for run, _ in planned if not (is_evaluated(run) and _is_up_to_date(run))]
+
+    def _to_evaluate(self) -> list[EvaluateSettings]:
+        """What is left, outdated results of which are put aside."""
+        runs = self._not_evaluated()
+        for run in runs:
+            if run.out.exists() and not finished_jobs(run.out).exists():
+                run.out.replace(run.out.with_suffix('.outdated.json'))
+        return runs
 
     def manifest(self) -> Manifest:
         """The policies of the study and the files of their results."""
@@ -291,10 +316,8 @@ def _jobs(tool: str, runs: Sequence[Any]) -> list[Job]:
     """One tool with each of the settings, kept as YAML beside the results."""
     jobs = []
     for run in runs:
-        preset = run.out.with_suffix('.yaml')
-        preset.write_text(
-            yaml.safe_dump({tool: run.model_dump(mode='json')}, sort_keys=False), encoding='utf-8'
-        )
+        preset = run.out.with_name(f'{run.out.name.removesuffix(".json")}.yaml')
+        write_text(preset, yaml.safe_dump({tool: run.model_dump(mode='json')}, sort_keys=False))
         invocation = Invocation(tool.replace('_', '-'), preset, run.out, Path.cwd())
         if isinstance(run, EvaluateSettings):
             jobs.append(Job(invocation, 1, partial(is_evaluated, run), run.processes))
@@ -302,6 +325,12 @@ def _jobs(tool: str, runs: Sequence[Any]) -> list[Job]:
             done = partial(last_step, run.out)
             jobs.append(Job(invocation, run.steps, done, run.threads, run.device != 'cpu'))
     return jobs
+
+
+def _is_up_to_date(settings: EvaluateSettings) -> bool:
+    """False if the data or policies have changed since they were evaluated."""
+    kept = read_json(settings.out).get('fingerprints')
+    return kept is None or kept == fingerprints(settings.dataset, settings.checkpoints)
 
 
 def is_evaluated(settings: EvaluateSettings) -> bool:

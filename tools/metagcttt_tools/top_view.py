@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+import tempfile
 from typing import TYPE_CHECKING
 
 from metagcttt_core import TrajectoryDataset
 from metagcttt_core.config import assets_dir, Settings
 from metagcttt_core.data import DatasetError
+from metagcttt_core.files import refuse_foreign
 import numpy as np
 from pydantic import Field, field_validator
 from sim_bridge.maze_map import MazeMap
@@ -57,17 +59,17 @@ def main(argv: list[str] | None = None) -> None:
     from metagcttt_tools.recordings.goal_views import read_goal_views
 
     try:
+        refuse_foreign(settings.out)
         dataset = TrajectoryDataset.load(
             settings.dataset or assets_dir() / _ASSETS / 'dataset.npz'
         )
         maze, views = read_goal_views(settings.recording, dataset, settings.robot)
-    except (DatasetError, FileNotFoundError) as error:
+    except (DatasetError, OSError) as error:
         fail(str(error))
     views = views[-settings.goals :]
     if settings.out.suffix == '.png':
         save(picture(maze, views), settings.out)
     else:
-        settings.out.parent.mkdir(parents=True, exist_ok=True)
         animate(maze, views, settings.frames, settings.out)
     reached = sum(view.reached for view in views)
     print(f'{len(views)} goals, {reached} reached: {settings.out}')
@@ -95,7 +97,7 @@ def animate(maze: MazeMap, views: Sequence[GoalView], frames: int, path: Path) -
     from matplotlib.animation import FuncAnimation, PillowWriter
     from matplotlib.figure import Figure
 
-    from metagcttt_tools.common.plots import COLORS
+    from metagcttt_tools.common.plots import COLORS, write_gif
 
     figure = Figure(figsize=(4, 4.3), layout='constrained')
     axes = figure.subplots()
@@ -111,7 +113,10 @@ def animate(maze: MazeMap, views: Sequence[GoalView], frames: int, path: Path) -
         return [axes]
 
     animation = FuncAnimation(figure, draw, frames=frames * len(views))
-    animation.save(path, writer=PillowWriter(fps=15), dpi=80)
+    with tempfile.TemporaryDirectory() as folder:
+        film = Path(folder, 'film.gif')
+        animation.save(film, writer=PillowWriter(fps=15), dpi=80)
+        write_gif(path, film.read_bytes())
 
 
 def _draw_surroundings(axes: Axes, maze: MazeMap, view: GoalView) -> None:

@@ -123,6 +123,8 @@ def test_heading_can_be_named(cart: RobotGoals) -> None:
         (named(x=math.inf), 'NOT_FINITE', 'x: inf'),
         (named([-1], x=1), 'NOT_FINITE', 'within -1'),
         (named([1, 2], x=1), 'WRONG_SIZE', '1 names, 1 values and 2 tolerances'),
+        (GoalRequest(0, names=('x', 'x'), values=(1, 2)), 'UNKNOWN_VALUE', 'x is named twice'),
+        (named(**{'z' * 10**7: 1}), 'UNKNOWN_VALUE', "no observed value is named 'zzz"),
         (GoalRequest(0, observation=np.zeros(3)), 'WRONG_SIZE', 'has 3 values'),
         (GoalRequest(0, observation=np.full(4, np.nan)), 'NOT_FINITE', 'not finite'),
         (

@@ -2,6 +2,7 @@ from pathlib import Path
 
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from metagcttt.policy import node as policy_node
 from metagcttt_core import make_agent, save_checkpoint, TrajectoryDataset
 import numpy as np
 import pytest
@@ -208,6 +209,26 @@ def test_failed_configuration_says_why_and_can_be_repeated(
     assert message in logged
     assert label(rig) == 'unconfigured'
     assert rig.set(**right) == ''
+    assert change(rig, Transition.TRANSITION_CONFIGURE)
+
+
+@pytest.mark.parametrize('fails', ['load_deployment', 'warm_up', 'PolicySession'])
+def test_unforeseen_failure_of_configure_is_named_and_not_final(
+    make_rig, monkeypatch, fails, capfd
+) -> None:
+    rig = make_rig()
+    assert change(rig, Transition.TRANSITION_DEACTIVATE)
+    assert change(rig, Transition.TRANSITION_CLEANUP)
+
+    def broken(*_args, **_named):
+        raise RuntimeError('a cosmic ray')
+
+    with monkeypatch.context() as patch:
+        patch.setattr(policy_node, fails, broken)
+        assert not change(rig, Transition.TRANSITION_CONFIGURE)
+    assert 'configuring failed: RuntimeError: a cosmic ray' in capfd.readouterr().err
+    assert rig.node._examine().message == 'configuring failed: RuntimeError: a cosmic ray'
+    assert label(rig) == 'unconfigured'
     assert change(rig, Transition.TRANSITION_CONFIGURE)
 
 

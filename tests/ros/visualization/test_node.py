@@ -9,6 +9,7 @@ from metagcttt_interfaces.msg import AdaptationReport, GoalQuery, MazeState
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
 import pytest
+from rcl_interfaces.msg import Log
 from rclpy.parameter import Parameter
 from tests.ros.graph import EVERY, Graph, RELIABLE
 from visualization_msgs.msg import Marker, MarkerArray
@@ -63,6 +64,22 @@ def test_report_on_a_million_ranges_is_ignored(
     tracemalloc.stop()
     assert node._segments == []
     assert peak < 2e8  # of 20 GB
+
+
+def test_state_whose_frame_is_no_name_is_not_copied_into_every_pose(
+    graph: Graph, checkpoint_folder: Path, dataset_file: Path
+) -> None:
+    logs = graph.collect(Log, '/rosout', EVERY)
+    node = graph.add(
+        VisualizationNode, checkpoint=str(checkpoint_folder), dataset=str(dataset_file)
+    )
+    send(graph, state(1))
+    long = state(2)
+    long.header.frame_id = 'm' * 256
+    graph.states.publish(long)
+    told = 'state: a message is ignored, its frame_id has 256 characters, 255 are accepted'
+    graph.wait(lambda: told in [log.msg for log in logs], 'the warning')
+    assert node._state.step == 1
 
 
 def test_path_is_bounded_and_starts_anew_with_the_episode(

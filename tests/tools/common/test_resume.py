@@ -140,6 +140,18 @@ def test_interrupted_evaluation_continues_by_its_file_alone(data, tmp_path, monk
     evaluate.main(['--out', str(out), '--resume'])
     (result,) = json.loads(out.read_text())['results']
     assert len(result['curve'][0]['per_seed']) == 2
+    assert not evaluate.finished_jobs(out).exists()
+    finished = out.read_bytes()
+    evaluate.main(['--out', str(out), '--resume'])  # nothing to do
+    assert out.read_bytes() == finished
+    assert 'episodes was 1 and is now 2' in refused(
+        capsys, evaluate, '--out', out, '--episodes', 2
+    )
+    save_checkpoint(
+        load_checkpoint(pretrained(data, tmp_path / 'other', seed=1) / 'checkpoint'), base
+    )
+    assert 'is of other policies' in refused(capsys, evaluate, '--out', out)
+    assert out.read_bytes() == finished
 
 
 def test_generation_continues_by_its_file_alone(tmp_path, capsys):
@@ -191,8 +203,7 @@ def test_second_writer_is_refused_while_the_first_lives(data, tmp_path, capsys):
 def test_policy_that_is_replaced_while_it_is_evaluated_is_refused(data, tmp_path):
     base = pretrained(data, tmp_path / 'base') / 'checkpoint'
     settings = evaluate.EvaluateSettings(checkpoints=(base,), dataset=data, episodes=1)
-    fingerprint = load_checkpoint(base).fingerprint()
-    evaluate._start_worker(settings, {str(base): fingerprint})
+    evaluate._start_worker(settings, evaluate.fingerprints(data, [base]))
     job = (str(base), 'pointmaze-medium-v0', 0, 0, 1)
     assert evaluate._outcome(job)[0] in (0, 1)
     other = load_checkpoint(pretrained(data, tmp_path / 'other', seed=1) / 'checkpoint')

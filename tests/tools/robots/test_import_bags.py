@@ -3,10 +3,12 @@
 from contextlib import closing
 from pathlib import Path
 import sqlite3
+from types import SimpleNamespace
 
 import mcap.reader
 import mcap.writer
 from metagcttt_core import TrajectoryDataset
+from metagcttt_tools.common import unpacking
 from metagcttt_tools.main import main
 import numpy as np
 import pytest
@@ -293,3 +295,23 @@ class TestContractCheck:
     def test_wrong_contract_is_named_with_its_line(self, contract_file, capsys):
         contract_file.write_text(DRIVE.replace('rate_hz: 10', 'rate_hz: 0'))
         assert f'{contract_file}:3: rate_hz' in self.check(contract_file, None, capsys, 2).err
+
+
+@pytest.mark.parametrize(
+    ('storage', 'compression', 'reason'),
+    [
+        (StoragePlugin.MCAP, CompressionMode.STORAGE, 'a chunk announces '),
+        (StoragePlugin.SQLITE3, CompressionMode.MESSAGE, 'a message unpacks to more than 500 '),
+        (StoragePlugin.SQLITE3, CompressionMode.FILE, 'unpacks to more than 500 bytes, half of'),
+    ],
+)
+def test_what_is_compressed_is_not_unpacked_without_end(
+    contract_file, tmp_path, monkeypatch, capsys, storage, compression, reason
+):
+    bag = write(tmp_path / 'bag', drive(), storage, compression)
+    monkeypatch.setattr(unpacking, 'LARGEST_PART', 500)
+    disk = SimpleNamespace(free=1000)
+    monkeypatch.setattr(unpacking, 'shutil', SimpleNamespace(disk_usage=lambda _: disk))
+    text = complaint(contract_file, bag, capsys)
+    assert str(bag) in text
+    assert reason in text

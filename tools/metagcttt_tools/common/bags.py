@@ -8,6 +8,10 @@ from metagcttt_core.data import DatasetError
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_typestore, Stores
 
+from metagcttt_tools.common.unpacking import bound_rosbags
+
+bound_rosbags()
+
 
 @contextmanager
 def open_any_bag(path: Path) -> Iterator[AnyReader]:
@@ -40,6 +44,9 @@ def reading(path: Path) -> Iterator[None]:
     """
     try:
         yield
+    except DatasetError as error:
+        named = str(error).startswith(str(path))
+        raise error if named else DatasetError(f'{path}: {error}') from error
     except FileNotFoundError as error:
         raise DatasetError(f'{path}: no such bag ({error})') from error
     except Exception as error:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, cast, Generic, TypeVar
 
 from metagcttt_core.config import error_lines
-from metagcttt_core.files import read_json_lines
+from metagcttt_core.files import read_json_lines, write_text
 from pydantic import BaseModel, ValidationError
 
 
@@ -29,27 +29,34 @@ class JobLog(Generic[Job]):
             resume: Keep what an earlier call for the same settings finished.
 
         Raises:
-            ValueError: If the file is of other settings; names the first that differs.
+            ValueError: If the file is of other settings; names the first that differs. Without
+                `resume`, if it is there.
         """
         self._path = path
         self.finished: dict[Job, Any] = {}
-        if resume and path.exists():
-            self._read(settings)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.exists():
+            self.settings(path)  # or it is none of ours
+            if not resume and len(read_json_lines(path)) > 1:
+                raise ValueError(
+                    f'{path}: holds what an interrupted call finished: pass --resume to continue, '
+                    'remove it to start anew, or choose another --out'
+                )
+            if resume:
+                self._read(settings)
         lines: list[dict[str, Any]] = [{'settings': settings}]
         lines += [{'job': job, 'result': result} for job, result in self.finished.items()]
-        self._file = path.open('w', encoding='utf-8')
-        self._write(*lines)
+        write_text(path, ''.join(map(_line, lines)))  # whole, and without a line cut short
+        self._file = path.open('a', encoding='utf-8')
 
     def add(self, job: Job, result: float | tuple[float, ...]) -> None:
         """Keep the result of a job."""
         self.finished[job] = result
-        self._write({'job': job, 'result': result})
+        self._file.write(_line({'job': job, 'result': result}))
+        self._file.flush()
 
-    def remove(self) -> None:
-        """Delete the file, once the results are kept elsewhere."""
+    def close(self) -> None:
+        """Close the file, which is to be deleted once the results are kept elsewhere."""
         self._file.close()
-        self._path.unlink()
 
     @staticmethod
     def settings(path: Path) -> dict[str, Any]:
@@ -63,10 +70,6 @@ class JobLog(Generic[Job]):
         if not isinstance(settings, dict) or not isinstance(settings.get('decisive'), dict):
             raise ValueError(f'{path}: does not begin with settings: remove it to start anew')
         return settings
-
-    def _write(self, *lines: dict[str, Any]) -> None:
-        self._file.writelines(json.dumps(line) + '\n' for line in lines)
-        self._file.flush()
 
     def _read(self, settings: dict[str, Any]) -> None:
         kept, asked = self.settings(self._path)['decisive'], settings['decisive']
@@ -83,3 +86,7 @@ class JobLog(Generic[Job]):
                 lines = '; '.join(error_lines(error))
                 raise ValueError(f'{self._path}:{number}: {lines}') from error
             self.finished[cast(Job, entry.job)] = entry.result
+
+
+def _line(entry: dict[str, Any]) -> str:
+    return json.dumps(entry) + '\n'

@@ -53,7 +53,7 @@ class Manifest(Settings):
         path = folder / FILE
         try:
             return cls.model_validate_json(path.read_bytes())
-        except FileNotFoundError as error:
+        except (FileNotFoundError, NotADirectoryError) as error:
             raise ValueError(f'{path} does not exist: run metagcttt sweep first') from error
         except ValidationError as error:
             raise ValueError(f'{path}: {"; ".join(error_lines(error))}') from error

@@ -1,6 +1,7 @@
 """Pictures of mazes, paths and success curves."""
 
 from collections.abc import Mapping, Sequence
+import io
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from metagcttt_core.files import atomic_write, PICTURE_MARK
 import numpy as np
 from sim_bridge.controllers.walk import Walk
 from sim_bridge.maze_map import MazeMap
@@ -36,9 +38,19 @@ def draw_segments(axes: Axes, segments: Sequence[np.ndarray]) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a picture and forget the figure."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=140, bbox_inches='tight')
+    """Write a picture, whole and with our mark."""
+    content = io.BytesIO()  # first: a full disk shall leave no half of it
+    mark = {'Software': PICTURE_MARK}
+    figure.savefig(content, format='png', dpi=140, bbox_inches='tight', metadata=mark)
+    with atomic_write(path) as file:
+        file.write(content.getvalue())
+
+
+def write_gif(path: Path, content: bytes) -> None:
+    """Write a GIF, whole and with our mark as its comment."""
+    comment = b'!\xfe' + bytes([len(PICTURE_MARK)]) + PICTURE_MARK.encode() + b'\0'
+    with atomic_write(path) as file:
+        file.write(content.removesuffix(b';') + comment + b';')
 
 
 def demo_picture(

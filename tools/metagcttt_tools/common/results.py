@@ -7,7 +7,7 @@ import platform
 from typing import Annotated, Any
 
 from metagcttt_core.config import Settings
-from metagcttt_core.files import write_json
+from metagcttt_core.files import refuse_foreign, write_json
 from pydantic import BaseModel, Field
 
 from metagcttt_tools.common.session import provenance
@@ -41,6 +41,11 @@ class Benchmark(Settings, ABC):
         """Measure, print a table and write JSON."""
 
 
+def beside(out: Path, ending: str) -> Path:
+    """The file of that ending beside a place that is named without one, or with .json."""
+    return out.with_name(out.name.removesuffix('.json') + ending)
+
+
 def markdown_table(rows: list[dict[str, Any]]) -> str:
     """Rows of equal keys as a Markdown table; numbers with three significant digits."""
     from tabulate import tabulate
@@ -59,12 +64,23 @@ def start_column(standing: bool) -> dict[str, str]:
     return {'start': 'standing'} if standing else {}
 
 
-def write_report(path: Path, settings: Settings, results: dict[str, Any]) -> None:
-    """Results as JSON, with settings, commit, versions and machine."""
+def write_report(
+    path: Path,
+    settings: Settings,
+    results: dict[str, Any],
+    fingerprints: dict[str, Any] | None = None,
+) -> None:
+    """Results as JSON, with settings, commit, versions, machine and hashes of what they are of.
+
+    Raises:
+        FileExistsError: If the file is there and was not made by a program of ours.
+    """
+    refuse_foreign(path)
     report = {
         'settings': settings.model_dump(mode='json'),
         **provenance(),
         'machine': {'processor': platform.machine(), 'cores': os.cpu_count()},
+        **({'fingerprints': fingerprints} if fingerprints else {}),
         'results': results,
     }
     write_json(path, report)

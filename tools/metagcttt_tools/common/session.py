@@ -15,18 +15,19 @@ from typing import Any, ClassVar, TYPE_CHECKING
 
 from filelock import FileLock, Timeout
 from metagcttt_core.config import Settings
-from metagcttt_core.files import write_json
+from metagcttt_core.files import in_words, refuse_foreign, write_json
 from pydantic import Field, field_validator
 from tqdm import tqdm
 
 from metagcttt_tools.common.cli import fail
 from metagcttt_tools.common.resume import leaves, nested, Resumable
-from metagcttt_tools.common.run_log import RunLog, SilentLog
+from metagcttt_tools.common.run_log import METRICS, RunLog, SilentLog
 from metagcttt_tools.common.stopping import stop_on_signal
 
 if TYPE_CHECKING:
     from metagcttt_core.training.run import TrainingRun
 
+SETTINGS = 'settings.json'
 SNAPSHOTS = 'snapshots'
 _PACKAGES = ('torch', 'numpy', 'mujoco', 'ogbench')
 
@@ -99,29 +100,60 @@ class Session:
 
 
 @contextmanager
-def sole_writer(path: Path) -> Iterator[None]:
-    """Keeps other processes from writing to the same results.
+def sole_writer(path: Path, *files: Path) -> Iterator[None]:
+    """Keeps other processes from writing to the same results, and these from foreign files.
 
     The lock is the kernel's (on network file systems the server's), so it ends with its holder,
     however that ends.
 
     Args:
         path: The folder or file of the results; its lock lies beside it.
+        files: What is going to be written, the record first; see `refuse_foreign`.
 
     Raises:
-        SystemExit: With status 2 if another process writes there.
+        SystemExit: With status 2 if another process writes there, or a file is somebody else's.
+        OSError: If the lock cannot be written.
     """
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(FileLock(lock_of(path), timeout=0))
+        except Timeout:
+            other = 'another process is writing there; wait for its end or choose another place'
+            fail(f'{path}: {other}')
+        if files:
+            ours_or_fail(*files)
+        yield
+
+
+def ours_or_fail(record: Path, *others: Path) -> None:
+    """End the process with status 2 if one of these files is there and not ours."""
     try:
-        with FileLock(lock_of(path), timeout=0):
-            yield
-    except Timeout:
-        fail(f'{path}: another process is writing there; wait for its end or choose another place')
+        refuse_foreign(record, *others)
+    except FileExistsError as error:
+        fail(str(error))
+
+
+@contextmanager
+def writes_dataset(path: Path, overwrite: bool) -> Iterator[None]:
+    """As `sole_writer`, for a dataset that is only replaced on request.
+
+    Raises:
+        SystemExit: With status 2, also if it exists and is not to be overwritten.
+    """
+    with sole_writer(path):
+        if path.exists() and not overwrite:
+            fail(f'{path} exists: give --overwrite or another --out')
+        yield
 
 
 def lock_of(path: Path) -> Path:
-    """The file that is locked while something writes to a folder or file of results."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return path.parent / f'.{path.name}.lock'
+    """The file that is locked while something writes to a folder or file of results.
+
+    It is the same by whatever links they are reached.
+    """
+    place = path.resolve()
+    place.parent.mkdir(parents=True, exist_ok=True)
+    return place.parent / f'.{place.name}.lock'
 
 
 @contextmanager
@@ -152,7 +184,8 @@ def training_session(
     try:
         with ExitStack() as stack:
             if writes:
-                stack.enter_context(sole_writer(settings.out))
+                files = files_of_run(settings.out)
+                stack.enter_context(sole_writer(settings.out, *files))
             first = _steps_to_continue_from(settings, steps)
             if writes:
                 write_settings(settings.out, settings)
@@ -178,9 +211,14 @@ def training_session(
             print(f'{interruption}; pass --resume to continue')
         raise SystemExit(stop.status) from interruption
     except OSError as error:
-        fail(f'{settings.out}: cannot be written ({error}); {left_behind(settings)}')
+        fail(f'{settings.out}: cannot be written ({in_words(error)}); {left_behind(settings)}')
     if writes:
         print(f'policy: {folder}')
+
+
+def files_of_run(folder: Path) -> tuple[Path, Path]:
+    """What every run writes into its folder, the record first."""
+    return folder / SETTINGS, folder / METRICS
 
 
 def snapshot_folder(run: Path, step: int) -> Path:
@@ -260,7 +298,7 @@ def provenance() -> dict[str, Any]:
 def write_settings(folder: Path, settings: Settings) -> None:
     """The resolved settings, beside a run's results."""
     record = {'settings': settings.model_dump(mode='json'), **provenance()}
-    write_json(folder / 'settings.json', record)
+    write_json(folder / SETTINGS, record)
 
 
 def use_threads(count: int) -> None:

@@ -1,5 +1,6 @@
 """Film a walking robot, with an arrow along the direction it follows."""
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -19,15 +20,19 @@ def film(follower: LearnedFollower, path: Path, seed: int, duration_s: float = 1
     """Write a GIF of a walk that turns by a right angle now and then."""
     from PIL import Image
 
+    from metagcttt_tools.common.plots import write_gif
+
     walk = walk_along(follower, np.array([1.0, 0.0]), duration_s, seed, QUARTER_TURNS_RAD)
     images = [Image.fromarray(frame) for frame in draw_walk(follower.robot, walk)]
     # One palette, that keeps the colour of the small arrow too: colours shall not flicker.
     palette = images[0].quantize(64, Image.Quantize.MAXCOVERAGE)
     frames = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    path.parent.mkdir(parents=True, exist_ok=True)
+    content = io.BytesIO()
+    duration_ms = 1000 // FRAMES_PER_S
     frames[0].save(
-        path, save_all=True, append_images=frames[1:], duration=1000 // FRAMES_PER_S, loop=0
+        content, 'GIF', save_all=True, append_images=frames[1:], duration=duration_ms, loop=0
     )
+    write_gif(path, content.getvalue())
 
 
 def draw_walk(robot: str, walk: Walk) -> list[np.ndarray]:

@@ -7,6 +7,8 @@ import signal
 import subprocess
 from typing import Self
 
+from metagcttt_core.files import not_through_links
+
 _ROS2RUN = Path(__file__).parents[2] / 'ros2run'
 # Also when the owner is killed.
 _ENDS_WITH_ITS_OWNER = ('setpriv', '--pdeathsig', 'TERM')
@@ -48,7 +50,7 @@ class NodeProcess:
         for name, other in (remappings or {}).items():
             command += ['-r', f'{name}:={other}']
         log.parent.mkdir(parents=True, exist_ok=True)
-        with log.open('wb') as output:
+        with open(log, 'wb', opener=not_through_links) as output:
             self._process = subprocess.Popen(
                 command,
                 stdout=output,

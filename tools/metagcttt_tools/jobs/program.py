@@ -11,6 +11,7 @@ import time
 from typing import NamedTuple
 
 from filelock import FileLock, Timeout
+from metagcttt_core.files import not_through_links
 
 from metagcttt_tools.common.session import lock_of
 from metagcttt_tools.common.stopping import REQUEUE
@@ -84,7 +85,7 @@ def run_program(job: Invocation, stopped: Callable[[], bool] = lambda: False) ->
         raise JobError(f'{lock}: is held by another process for {_LOCK_TIMEOUT_S:g} s') from error
     # The kernel sends the signal; a process that nobody waits for must not train on.
     leash = ['setpriv', '--pdeathsig', 'TERM', '--'] if shutil.which('setpriv') else []
-    with job.log.open('a', encoding='utf-8') as log:
+    with open(job.log, 'a', encoding='utf-8', opener=not_through_links) as log:
         began = time.strftime('%Y-%m-%d %H:%M:%S')
         log.write(f'{ATTEMPT} {began} on {platform.node()}: metagcttt {job.program}\n')
         log.flush()

@@ -7,20 +7,19 @@ from pathlib import Path
 import struct
 from typing import Any, cast, IO
 
-import lz4.frame
 from mcap.exceptions import EndOfFile, InvalidMagic, McapError, RecordLengthLimitExceeded
 from mcap.records import Channel, Chunk, Footer, McapRecord, Message, Schema
 from mcap.stream_reader import breakup_chunk, StreamReader
 from mcap.writer import MCAP0_MAGIC
 from mcap_ros2.decoder import DecoderFactory
+from metagcttt_core.data.bounds import check_announced, check_memory
 from metagcttt_core.data.errors import DatasetError
 import zstandard
 
+from metagcttt_tools.common.unpacking import unpack
+
 BACK_NS = 10**9
 """Messages that overtake others do so by less; a clock that was set back goes further."""
-
-LARGEST_CHUNK = 256 << 20
-"""Bytes of a chunk of messages; recorders write some megabytes."""
 
 SILENCE_NS = 10 * 10**9
 """Nodes report their health every second: a longer silence is a clock set forward, or a break."""
@@ -126,22 +125,11 @@ def _unpacked(record: McapRecord) -> list[McapRecord]:
     """The records in a chunk, which is unpacked only as far as it says; or the record itself.
 
     Raises:
-        ValueError: If the chunk is larger than any recorder makes them, or not as large as it
-            says.
+        ValueError: See `unpack`.
     """
     if not isinstance(record, Chunk):
         return [record]
-    size, compression = record.uncompressed_size, record.compression
-    if size > LARGEST_CHUNK:
-        raise ValueError(f'a chunk announces {size} bytes, at most {LARGEST_CHUNK} are read')
-    data = record.data
-    if compression == 'zstd':
-        with zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True) as stream:
-            data = stream.read(size + 1)
-    elif compression == 'lz4':
-        data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
-    if len(data) != size:
-        raise ValueError(f'a chunk does not unpack to {size} bytes, as it says')
+    data = unpack(record.data, record.compression, record.uncompressed_size)
     return breakup_chunk(replace(record, compression='', data=data), validate_crc=True)
 
 
@@ -165,13 +153,15 @@ def read_messages(path: Path, type_names: Collection[str]) -> RecordedMessages:
     topics: dict[str, str] = {}
     complete = False
     clocks = Clocks()
+    decoded = 0
     try:
         with path.open('rb') as file:
+            num_bytes = path.stat().st_size
             reader = StreamReader(
                 cast('IO[bytes]', _File(file)),
                 validate_crcs=True,
                 emit_chunks=True,
-                record_size_limit=max(path.stat().st_size, 8),
+                record_size_limit=max(num_bytes, 8),
             )
             for record in chain.from_iterable(map(_unpacked, reader.records)):
                 if isinstance(record, Schema):
@@ -188,6 +178,8 @@ def read_messages(path: Path, type_names: Collection[str]) -> RecordedMessages:
                     if decode is None:
                         continue
                     topic = channels[record.channel_id].topic
+                    check_announced(decoded := decoded + len(record.data), num_bytes, 'it')
+                    check_memory(4 * decoded, 'it')
                     content, published_ns = decode(record.data), record.publish_time
                     found.append(Recorded(topic, topics[topic], published_ns, content, stretch))
                 elif isinstance(record, Footer):

@@ -17,10 +17,11 @@ BACK = 'steps back in time'
 GAPS = 'gaps between states'
 STAMPS = 'jumps of the stamps'
 CLOCK_JUMPS = 'jumps of a clock'
+WORLDS = 'changes to another world'
 SENDERS = 'steps with several senders of actions'
 CONTESTED = 'transitions to a state that was recorded twice'
 OTHER_STATE = 'actions for another state than the last one'
-MISFITS = (BACK, GAPS, STAMPS, CLOCK_JUMPS, SENDERS, CONTESTED)
+MISFITS = (BACK, GAPS, STAMPS, CLOCK_JUMPS, WORLDS, SENDERS, CONTESTED)
 """Reasons that two states in sequence are not two states of one robot in sequence."""
 
 
@@ -37,6 +38,16 @@ def usual_period_s(states: Iterable[Any]) -> float:
 
 def _stamp_s(state: Any) -> float:
     return state.header.stamp.sec + 1e-9 * state.header.stamp.nanosec
+
+
+def _world(message: Any) -> int:
+    """What tells a simulator from the next one with the same numbers; 0 in older recordings."""
+    return int(getattr(message, 'world_id', 0))
+
+
+def _moment(message: Any) -> tuple[int, int, int]:
+    """The state that a message is, or is for."""
+    return _world(message), message.episode_id, message.step
 
 
 @dataclass
@@ -66,7 +77,7 @@ class Robot:
         """Remember the newest action for the current state; the simulator does the same."""
         self._senders_ns[getattr(message, 'instance', 0)] = published_ns
         state = self._state
-        if state is None or (message.episode_id, message.step) != (state.episode_id, state.step):
+        if state is None or _moment(message) != _moment(state):
             self.dropped[OTHER_STATE] += 1
         elif not np.isfinite(message.values).all():
             self.dropped['actions that are not finite'] += 1
@@ -80,7 +91,7 @@ class Robot:
             self.dropped['states that are not finite'] += 1
             return
         if last is not None:
-            if (message.episode_id, message.step) == (last.episode_id, last.step) and (
+            if _moment(message) == _moment(last) and (
                 list(message.observation) == list(last.observation)
             ):
                 self.dropped['repeated states'] += 1
@@ -113,6 +124,8 @@ class Robot:
         """The reason why two states of an episode form no transition; empty if they do."""
         if state.episode_id != last.episode_id:
             return ''
+        if _world(state) != _world(last):
+            return WORLDS
         if state.step <= last.step:
             if state.step:  # not a simulator that began again
                 self._contest(last.step - state.step)

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 import copy
+from functools import wraps
 import math
 from typing import Any
 
@@ -26,6 +27,7 @@ OVERRIDDEN = (
 )
 OF_ROS = ('/parameter_events', '/rosout')
 TYPES_PERIOD_S = 1.0
+MAX_NAME = 255  # characters in the name of a frame
 
 
 class ConventionalNode(Node):
@@ -37,6 +39,7 @@ class ConventionalNode(Node):
       `qos_overrides.TOPIC.publisher.reliability` and their kin.
     - Where it and another node cannot hear one another, because of a quality of service or because
       a topic has two types, such as Twist and TwistStamped, a warning names both sides.
+    - A message whose frame is no name, but megabytes, is ignored: it would be sent on many times.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -103,7 +106,27 @@ class ConventionalNode(Node):
         """Create a subscription; see the class for what it has besides."""
         profile, kwargs = self._conventions(msg_type, topic, qos_profile, kwargs, False)
         with _override_errors(topic):
-            return super().create_subscription(msg_type, topic, callback, profile, **kwargs)
+            subscription = super().create_subscription(
+                msg_type, topic, self._bounded(topic, callback), profile, **kwargs
+            )
+        return subscription
+
+    def _bounded(self, topic: str, callback: Any) -> Any:
+        """The callback, for messages whose frame is a name: it is copied into what is sent."""
+
+        @wraps(callback)
+        def bounded(message: Any, *info: Any) -> Any:
+            length = len(getattr(getattr(message, 'header', None), 'frame_id', ''))
+            if length > MAX_NAME:
+                self.get_logger().warning(
+                    f'{topic}: a message is ignored, its frame_id has {length} characters, '
+                    f'{MAX_NAME} are accepted',
+                    throttle_duration_sec=5.0,
+                )
+                return None
+            return callback(message, *info)
+
+        return bounded
 
     def _conventions(
         self, msg_type: Any, topic: str, profile: Any, kwargs: dict[str, Any], publishes: bool

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 import signal
 import threading
+import traceback
 
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -53,7 +54,10 @@ def diffbot_driver() -> int:
 
 
 def _run(make_node: Callable[[], Node]) -> int:
-    """Spin a node until a signal comes, which rclpy's own handlers would not survive."""
+    """Spin a node until a signal comes, which rclpy's own handlers would not survive.
+
+    A message that a callback cannot take is logged; it ends no node.
+    """
     import rclpy
     from rclpy.signals import SignalHandlerOptions
 
@@ -65,7 +69,11 @@ def _run(make_node: Callable[[], Node]) -> int:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     while not stop.is_set():
-        executor.spin_once(timeout_sec=0.1)
+        try:
+            executor.spin_once(timeout_sec=0.1)
+        except Exception as error:  # noqa: BLE001 - this is the guard
+            text = ''.join(traceback.format_exception(error))
+            node.get_logger().error(f'a callback failed: {text}', throttle_duration_sec=1.0)
     executor.shutdown()
     node.destroy_node()
     rclpy.try_shutdown()

@@ -1,5 +1,6 @@
 """Goals of a robot with a contract: poses, named values and whole observations."""
 
+from collections import Counter
 from collections.abc import Sequence
 from itertools import chain
 import math
@@ -103,6 +104,8 @@ class RobotGoals:
                 f'{len(names)} names, {len(values)} values and {len(tolerances)} tolerances do '
                 'not fit together',
             )
+        if twice := next((name for name, count in Counter(names).items() if count > 1), ''):
+            raise _Refused('UNKNOWN_VALUE', f'{twice} is named twice, each value may be once')
         fixed: dict[int, float] = {}
         terms: list[Term] = []
         for number, (name, value) in enumerate(zip(names, values, strict=True)):
@@ -111,9 +114,12 @@ class RobotGoals:
                 raise _Refused('NOT_FINITE', f'{name}: {value} within {tolerance} is no goal')
             columns, is_pair = self._contract.groups.get(name, ([], False))
             if is_pair and len(columns) == 2:
-                fixed |= zip(columns, (math.cos(value), math.sin(value)), strict=True)
+                new = dict(zip(columns, (math.cos(value), math.sin(value)), strict=True))
             else:
-                fixed[self._column(name)] = value
+                new = {self._column(name): value}
+            if fixed.keys() & new.keys():
+                raise _Refused('UNKNOWN_VALUE', f'{name} is named twice, by another name too')
+            fixed |= new
             terms += self._terms(name, tolerance)
         return self._completed(fixed, terms)
 

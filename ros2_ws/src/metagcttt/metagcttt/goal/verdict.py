@@ -26,10 +26,21 @@ Error = Literal[
 ]
 """The names of the error codes of ReachGoal's result."""
 
+MAX_REASON = 1000
+
 
 @dataclass(frozen=True)
 class Verdict:
-    """The reason why a goal is refused, or how it ended: a code and the words."""
+    """The reason why a goal is refused, or how it ended: a code and the words.
+
+    Words that repeat what was sent are cut at `MAX_REASON` characters: events and results are kept
+    for those who join late, and a name of megabytes would be kept with them.
+    """
 
     error: Error
     reason: str
+
+    def __post_init__(self) -> None:
+        """Cut the words."""
+        if len(self.reason) > MAX_REASON:
+            object.__setattr__(self, 'reason', f'{self.reason[:MAX_REASON]}...')

@@ -1,6 +1,7 @@
 """The policy node and its lifecycle; `session` has its behaviour while configured."""
 
 import secrets
+import traceback
 from typing import Any
 
 from metagcttt_core import FilterConfig
@@ -56,6 +57,20 @@ class PolicyNode(ConventionalNode, LifecycleNode):
         self.get_logger().warning(f'refused transition {transition_id}: the node is {state}')
         return TransitionCallbackReturn.FAILURE
 
+    def _LifecycleNodeMixin__execute_callback(
+        self, current_state_id: int, previous_state: LifecycleState
+    ) -> TransitionCallbackReturn:
+        """Say why a transition fails; rclpy's own is silent and finalises the node for ever."""
+        callback = self._callbacks.get(current_state_id)
+        try:
+            return callback(previous_state) if callback else TransitionCallbackReturn.SUCCESS
+        except Exception as error:  # noqa: BLE001 - this is a guard, see `guard`
+            _, state = self._state_machine.current_state
+            self._failure = f'{state} failed: {type(error).__name__}: {error}'
+            text = ''.join(traceback.format_exception(error))
+            self.get_logger().error(f'{self._failure}\n{text}')
+            return TransitionCallbackReturn.FAILURE
+
     def destroy_node(self) -> None:
         """End the adaptation thread, then destroy the node."""
         self._close_session()
@@ -65,12 +80,12 @@ class PolicyNode(ConventionalNode, LifecycleNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load policy and dataset, and connect; a failure leaves the node unconfigured."""
-        config = FilterConfig(
-            variant=self._settings['filter_variant'],
-            epsilon=self._settings['epsilon'] or 1.0,
-            top_percent=self._settings['top_percent'],
-        )
         try:
+            config = FilterConfig(
+                variant=self._settings['filter_variant'],
+                epsilon=self._settings['epsilon'] or 1.0,
+                top_percent=self._settings['top_percent'],
+            )
             deployment = load_deployment(
                 self._settings['checkpoint'],
                 self._settings['dataset'],

@@ -2,6 +2,8 @@
 
 from collections.abc import Iterator, Sequence
 from importlib import import_module
+from itertools import count
+import os
 from pathlib import Path
 import re
 from typing import Any
@@ -177,8 +179,7 @@ class Recording:
         """
         if self._split_bytes and self._file.tell() >= self._split_bytes:
             self._close_file()
-            stem = self._first.stem.removesuffix('_0') if self._folder else self._first.stem
-            self._open(self._first.with_stem(f'{stem}_{len(self.paths)}'))
+            self._open(self._next())
         self._writer.add_message(
             self._channels[topic],
             log_time=log_time,
@@ -199,6 +200,12 @@ class Recording:
         """Write the index and close the file."""
         self._close_file()
         self._write_metadata()
+
+    def _next(self) -> Path:
+        """The file after the last one: of the next number that is free."""
+        stem = self._first.stem.removesuffix('_0') if self._folder else self._first.stem
+        names = (self._first.with_stem(f'{stem}_{number}') for number in count(len(self.paths)))
+        return next(path for path in names if not os.path.lexists(path))
 
     def _close_file(self) -> None:
         self._writer.finish()
