@@ -1,14 +1,18 @@
 """The commands of paper.yaml, as they stand there, on studies in miniature."""
 
-import os
+from collections.abc import Iterator
+from concurrent.futures import Executor, Future
 from pathlib import Path
-import subprocess
-import sys
+import shlex
 from typing import Any
 
+from metagcttt_tools import evaluate, sweep
 from metagcttt_tools.common.evidence import read_evidence
 from metagcttt_tools.common.presets import load_preset
+from metagcttt_tools.jobs.scheduler import Job
+from metagcttt_tools.main import main
 import pytest
+from sim_bridge.mazes import ogbench, ogbench_layouts
 import yaml
 
 ARTEFACTS = read_evidence(Path(__file__).parents[1] / 'docs/results/paper.yaml').artefacts
@@ -34,6 +38,44 @@ def in_miniature(study: str, file: Path) -> dict[str, Any]:
     return preset
 
 
+class Here(Executor):
+    """Calls functions in this process: a study starts dozens, and each imports PyTorch."""
+
+    def __init__(self, *_: Any, initializer: Any = None, initargs: Any = (), **__: Any) -> None:
+        if initializer:
+            initializer(*initargs)
+
+    def submit(self, function: Any, *arguments: Any) -> Future[Any]:
+        done: Future[Any] = Future()
+        done.set_result(function(*arguments))
+        return done
+
+
+class JobsHere(Here):
+    """The same for the runs of a study."""
+
+    def submit(self, job: Job) -> Future[None]:
+        return super().submit(
+            main, [job.invocation.program, '--preset', str(job.invocation.preset)]
+        )
+
+    def stop(self) -> None:
+        raise AssertionError('a run failed')
+
+
+@pytest.fixture
+def brief(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Everything happens in this process, and episodes have an end soon."""
+    monkeypatch.setattr(sweep, 'LocalScheduler', JobsHere)
+    monkeypatch.setattr(evaluate, 'ProcessPoolExecutor', Here)
+    monkeypatch.setattr(evaluate, 'end_with_parent', lambda: None)
+    monkeypatch.setitem(ogbench_layouts.ROBOTS['pointmaze'].max_episode_steps, 'medium', 25)
+    assert ogbench_layouts.ROBOTS['antmaze'].max_episode_steps['medium'] == 25
+    ogbench.describe.cache_clear()
+    yield
+    ogbench.describe.cache_clear()
+
+
 def test_every_command_belongs_to_a_study() -> None:
     assert all(sum(study in line for study in STUDIES) == 1 for line in COMMANDS)
     assert len(COMMANDS) >= 9
@@ -42,7 +84,10 @@ def test_every_command_belongs_to_a_study() -> None:
 @pytest.mark.mujoco
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize('study', STUDIES)
-def test_commands_run(study: str, tmp_path: Path) -> None:
+def test_commands_run(
+    study: str, tmp_path: Path, brief: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     file = tmp_path / f'{study}.yaml'
     file.write_text(yaml.safe_dump(in_miniature(study, file)))
     lines = [
@@ -53,13 +98,10 @@ def test_commands_run(study: str, tmp_path: Path) -> None:
         if study in line
     ]
     (tmp_path / 'docs' / 'results').mkdir(parents=True)
-    path = f'{Path(sys.executable).parent}:{os.environ["PATH"]}'
     for line in [f'metagcttt generate --preset {file}', *lines]:
-        done = subprocess.run(
-            ['bash', '-c', line], cwd=tmp_path, env=os.environ | {'PATH': path},
-            capture_output=True, text=True,
-        )  # fmt: skip
-        assert done.returncode == 0, f'{line}\n{done.stdout}\n{done.stderr}'
+        program, *arguments = shlex.split(line)
+        assert program == 'metagcttt'
+        main(arguments)
     made = {path.name for path in (tmp_path / 'docs' / 'results').iterdir()}
     for artefact in ARTEFACTS:
         if artefact.preset == study:

@@ -70,6 +70,7 @@ def drive(graph: Graph, record: Record, task_id: int, seed: int) -> int:
         ),
         'the last action',
     )
+    graph.wait(lambda: any(r.episode_id == episode_id for r in record.reports), 'the adaptation')
     return episode_id
 
 

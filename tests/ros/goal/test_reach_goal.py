@@ -42,6 +42,7 @@ def test_goal_is_reached(rig: GoalRig) -> None:
     assert (result.success, result.steps, result.error_code) == (True, 2, Result.NONE)
     assert result.seconds > 0
     assert result.error_msg == ''
+    rig.graph.wait(lambda: len(rig.record.queries) == 2, 'the end of the query')
     assert [query.active for query in rig.record.queries] == [True, False]
 
 
@@ -134,7 +135,7 @@ def test_newer_action_goal_preempts(rig: GoalRig) -> None:
     rig.state(x=4.0, step=1)
     rig.state(y=4.0, step=2)
     assert second.result().success
-    [ended] = rig.record.of_kind(EpisodeEvent.ENDED)
+    [ended] = rig.graph.wait(lambda: rig.record.of_kind(EpisodeEvent.ENDED), 'the event')
     assert (ended.query_id, ended.error_code) == (1, Result.PREEMPTED)
 
 
@@ -196,7 +197,7 @@ def test_goal_sent_right_after_a_reset_belongs_to_the_new_episode(rig: GoalRig) 
     rig.state(episode_id=2)
     rig.state(x=4.0, step=1, episode_id=2)
     assert sent.result().steps == 1
-    assert rig.record.queries[0].episode_id == 2
+    assert rig.graph.wait(lambda: rig.record.queries, 'the query')[0].episode_id == 2
 
 
 def test_goal_waits_for_its_episode_and_refuses_one_that_is_over(rig: GoalRig) -> None:

@@ -19,24 +19,40 @@ CHROMIUM, DRIVER = shutil.which('chromium'), shutil.which('chromedriver')
 needs_chromium = pytest.mark.skipif(
     not (CHROMIUM and DRIVER), reason='no Chromium with a driver here: tools/chromium.sh as root'
 )
-_FIELD_OF_VIEW = np.radians(75)  # vertical, of a camera that nobody has moved
+_FIELD_OF_VIEW = np.radians(75)  # vertical
 # As root in a container, and drawn by the processor.
 _OPTIONS = (
-    *('--headless=new', '--no-sandbox', '--disable-dev-shm-usage', '--window-size=1000,700'),
+    *('--headless=new', '--no-sandbox', '--disable-dev-shm-usage'),
     *('--use-angle=swiftshader', '--enable-unsafe-swiftshader'),
 )
+
+
+def drawn_at(
+    maze: MazeMap, point: tuple[float, float, float], width: float, height: float
+) -> tuple[float, float]:
+    """Pixels from the middle of a picture, to the right and down, at which a point is drawn."""
+    camera, target = (np.array(place) for place in viewpoint(maze, width / height))
+    ahead = (target - camera) / np.linalg.norm(target - camera)
+    right = np.cross(ahead, (0, 0, 1)) / np.linalg.norm(np.cross(ahead, (0, 0, 1)))
+    ray = np.array(point) - camera
+    seen = np.array((ray @ right, -(ray @ np.cross(right, ahead)))) / (ray @ ahead)
+    x, y = seen * height / 2 / np.tan(_FIELD_OF_VIEW / 2)
+    return float(x), float(y)
 
 
 class Browser:
     """A tab with the live view."""
 
-    def __init__(self, url: str, maze: MazeMap) -> None:
+    def __init__(self, url: str, maze: MazeMap, size: tuple[int, int] = (1000, 560)) -> None:
         options = webdriver.ChromeOptions()
         options.binary_location = CHROMIUM
         for option in _OPTIONS:
             options.add_argument(option)
         self._maze = maze
         self.driver = webdriver.Chrome(options=options, service=Service(DRIVER))
+        width, height = size  # of the page; a window is never narrower than 500
+        metrics = {'width': width, 'height': height, 'deviceScaleFactor': 1, 'mobile': False}
+        self.driver.execute_cdp_cmd('Emulation.setDeviceMetricsOverride', metrics)
         self.driver.get(url)
 
     def __enter__(self) -> Self:
@@ -49,17 +65,11 @@ class Browser:
         return self.driver.find_element(By.TAG_NAME, 'body').text
 
     def click_floor(self, xy: tuple[float, float]) -> None:
-        """Click where a point of the floor is drawn."""
-        camera, target = (np.array(point) for point in viewpoint(self._maze))
-        ahead = (target - camera) / np.linalg.norm(target - camera)
-        right = np.cross(ahead, (0, 0, 1)) / np.linalg.norm(np.cross(ahead, (0, 0, 1)))
-        ray = np.array((*xy, 0.0)) - camera
-        seen = np.array((ray @ right, -(ray @ np.cross(right, ahead)))) / (ray @ ahead)
+        """Click where a point of the floor is drawn, by a camera that nobody has moved."""
         canvas = self.driver.find_element(By.TAG_NAME, 'canvas')
-        pixels = seen * canvas.rect['height'] / 2 / np.tan(_FIELD_OF_VIEW / 2)
-        x, y = (round(float(value)) for value in pixels)
+        x, y = drawn_at(self._maze, (*xy, 0.0), canvas.rect['width'], canvas.rect['height'])
         webdriver.ActionChains(self.driver).move_to_element_with_offset(
-            canvas, x, y
+            canvas, round(x), round(y)
         ).click().perform()
 
     def click_button(self, label: str) -> None:

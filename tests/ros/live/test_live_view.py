@@ -22,6 +22,7 @@ from tests.ros.live.browser import Browser, needs_chromium
 
 MAZE = maze_map('pointmaze-medium-v0')
 STATES = ('metagcttt_interfaces/msg/MazeState',)
+TELEPHONE = (390, 844)
 FAR, NEAR = (20.0, 20.0), (4.0, 0.0)
 
 pytestmark = [pytest.mark.slow, pytest.mark.mujoco, pytest.mark.timeout(600), needs_chromium]
@@ -137,13 +138,15 @@ def test_lost_browser_and_lost_nodes_harm_nothing(
         browser.click_floor(FAR)
         goal(graph, record, 1)
     assert end_of_goal(graph, record, 1).kind == EpisodeEvent.REACHED
-    with Browser(view.url, MAZE) as browser:
+    with Browser(view.url, MAZE, TELEPHONE) as browser:
         browser.wait_for_text('goal 1 reached')
         nodes['policy_node'].kill()
         browser.wait_for_text('policy_node: silent')
         start_process('policy_node')
         browser.wait(lambda: 'silent' not in browser.text(), 'the new policy')
         browser.click_floor(NEAR)
+        clicked = goal(graph, record, 2).position
+        assert (clicked.x, clicked.y) == pytest.approx(NEAR, abs=0.3)
         graph.wait(lambda: [r for r in record.reports if r.query_id == 2], 'an adaptation')
     assert view.poll() is None
 

@@ -285,7 +285,7 @@ def test_paused_simulator_is_no_fault(sim_rig: FaultRig) -> None:
     for _ in range(20):  # twice as long as the timeout
         sim_rig.state(step=sim_rig._step)
         sim_rig.graph.wait_for(0.1)
-    assert len(sim_rig.record.actions) >= 10
+    sim_rig.graph.wait(lambda: len(sim_rig.record.actions) >= 10, 'actions')
     assert all(any(action.values) for action in sim_rig.record.actions)
     statuses = [status for array in sim_rig.diagnostics for status in array.status]
     assert {status.message for status in statuses} == {'acting with the adapted policy'}

@@ -16,6 +16,7 @@ from metagcttt_tools.live.scene import floor_point, viewpoint
 import numpy as np
 import pytest
 from sim_bridge import maze_map
+from tests.ros.live.browser import drawn_at
 from tests.ros.maze_walks import maze_walks
 
 MAZE = maze_map('pointmaze-medium-v0')
@@ -85,3 +86,23 @@ def test_ray_meets_the_floor_where_it_was_aimed() -> None:
     assert floor_point(camera, np.array((4.0, 8.0, 0.0)) - camera) == pytest.approx((4.0, 8.0))
     assert floor_point(camera, (0.0, 1.0, 0.0)) is None  # along the floor
     assert floor_point(camera, (0.0, 0.0, 1.0)) is None  # away from it
+
+
+@pytest.mark.parametrize(
+    ('width', 'height', 'free'),
+    [(960, 800, 1.0), (1600, 900, 1.0), (680, 700, 1.0), (524, 390, 1.0), (390, 844, 0.4)],
+    ids=['desktop', 'wide', 'narrow', 'telephone on its side', 'telephone'],
+)
+@pytest.mark.parametrize('name', ['pointmaze-medium-v0', 'pointmaze-giant-v0'])
+def test_all_of_the_maze_is_in_view(name: str, width: int, height: int, free: float) -> None:
+    """On a telephone held upright, in the upper two fifths: the panel lies over the others."""
+    maze = maze_map(name)
+    xmin, xmax, ymin, ymax = maze.extent
+    wall_m = maze.unit_m / 3
+    corners = np.array([(x, y) for x in (xmin, xmax) for y in (ymin, ymax)])
+    drawn = np.array(
+        [drawn_at(maze, (*corner, z), width, height) for corner in corners for z in (0, wall_m)]
+    )
+    assert (np.abs(drawn[:, 0]) <= width / 2).all()
+    assert (drawn[:, 1] >= -height / 2).all() and (drawn[:, 1] <= height * (free - 0.5)).all()
+    assert np.ptp(drawn[:, 0]) > 0.6 * min(width, height), 'it is drawn large enough'

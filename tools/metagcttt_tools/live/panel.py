@@ -1,6 +1,6 @@
 """The panel beside the scene: what the robot does, the health of its nodes, and the controls."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -50,6 +50,7 @@ class Panel:
             gui: Of the server.
             hint: What to do first.
         """
+        self._hint = hint
         self._state = gui.add_markdown('', order=_FIRST)
         self._message = gui.add_markdown(hint, order=_FIRST)
         with gui.add_folder('Loss over K steps', order=_LAST):
@@ -67,6 +68,11 @@ class Panel:
     def say(self, text: str) -> None:
         """Show a message, such as why a request failed."""
         self._message.content = text
+
+    def take_back(self, text: str) -> None:
+        """Show the hint again in place of this message, unless another one has come."""
+        if self._message.content == text:
+            self._message.content = self._hint
 
     def show_state(self, text: str) -> None:
         """Show what the robot is doing."""
@@ -102,7 +108,7 @@ class GraphControls:
         self._policy = gui.add_dropdown('Policy', ('',))
         self._record = gui.add_checkbox('Record', False)
 
-        def ask_steps(event: viser.GuiEvent) -> None:
+        async def ask_steps(event: viser.GuiEvent) -> None:
             if event.client is not None:  # else it is the value that the graph has
                 controls.set_steps(int(self._steps.value) if self._adapt.value else 0)
 
@@ -164,9 +170,20 @@ class Player:
         _set(self._time, 'value', round(time_s, 1))
 
 
-def _by_hand(ask: Callable[[Any], None]) -> Callable[[viser.GuiEvent], None]:
-    """Ask for a value that a browser set, not for one that the program shows."""
-    return lambda event: ask(event.target.value) if event.client is not None else None
+def _by_hand(
+    ask: Callable[[Any], None],
+) -> Callable[[viser.GuiEvent], Coroutine[Any, Any, None]]:
+    """Ask for a value that a browser set, not for one that the program shows.
+
+    A coroutine, since viser calls functions later, in a thread: by then the program may have
+    shown the value that the graph still has.
+    """
+
+    async def at_once(event: viser.GuiEvent) -> None:
+        if event.client is not None:
+            ask(event.target.value)
+
+    return at_once
 
 
 def _set(handle: Any, name: str, value: Any) -> None:

@@ -58,6 +58,7 @@ class Picture:
 
     Attributes:
         grid: The map it was made for; None for an open floor.
+        maze: That map, or the open floor.
         fault: Why something is not shown, in words; empty when there is nothing new to say.
     """
 
@@ -70,10 +71,10 @@ class Picture:
             pool: For loading and adapting.
         """
         self.grid, self.fault = seen.grid, ''
-        self._maze = floor_of(seen)
-        self._scene = MazeScene(server, self._maze)
+        self.maze = floor_of(seen)
+        self._scene = MazeScene(server, self.maze)
         self._seen, self._pool = seen, pool
-        self._points = grid_of(self._maze)
+        self._points = grid_of(self.maze)
         self._dims: list[int] = []
         self._names: tuple[Any, ...] = ()
         self._loading: Future[Deployed] | None = None

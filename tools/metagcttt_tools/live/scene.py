@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import cast, TYPE_CHECKING
+from typing import Any, cast, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +21,12 @@ WALL: Color = (120, 130, 145)
 DATA: Color = (190, 190, 190)
 RETRIEVED: Color = (0, 114, 178)
 ROBOT: Color = (213, 94, 0)
+NOSE: Color = (90, 30, 0)
 GOAL: Color = (255, 200, 0)
 BEFORE: Color = (170, 30, 110)
 AFTER: Color = (0, 100, 60)
+
+LANDSCAPE = 4 / 3
 
 _DATA_POINTS = 8000
 _SEGMENT_POINTS = 4000
@@ -67,13 +70,18 @@ class MazeScene:
                 '/robot', radius=0.18 * self._unit, color=ROBOT, visible=False
             )
             self._nose = self._scene.add_arrows(
-                '/nose', np.zeros((1, 2, 3)), ROBOT, shaft_radius=0.05 * self._unit, visible=False
+                '/nose',
+                np.zeros((1, 2, 3)),
+                NOSE,
+                shaft_radius=0.04 * self._unit,
+                head_radius=0.1 * self._unit,
+                head_length=0.15 * self._unit,
+                visible=False,
             )
             self._goal = self._scene.add_cylinder(
                 '/goal', radius=1.0, height=thick, color=GOAL, visible=False
             )
-        camera = server.initial_camera
-        camera.position, camera.look_at = (np.array(point) for point in viewpoint(maze))
+        aim(server.initial_camera, *viewpoint(maze))
 
     def move_robot(self, xy: tuple[float, float], heading: tuple[float, float] | None) -> None:
         """Put the robot at a position; one without links also looks along a unit vector."""
@@ -82,7 +90,7 @@ class MazeScene:
         self._nose.visible = heading is not None
         if heading is not None:
             nose = np.array([np.zeros(2), 0.45 * self._unit * np.array(heading)]) + np.array(xy)
-            self._nose.points = _raised(nose[None], self._robot.radius)
+            self._nose.points = _raised(nose[None], 2 * self._robot.radius)  # over the walls
 
     def add_body(self, body: Body) -> None:
         """Give the robot its links, to be posed."""
@@ -178,12 +186,28 @@ def _wall_boxes(maze: MazeMap, height_m: float) -> Iterator[trimesh.Trimesh]:
             yield box.apply_translation(((x0 + x1) / 2, y, height_m / 2))
 
 
-def viewpoint(maze: MazeMap) -> tuple[Point, Point]:
-    """The first position of the camera, and the point it looks at."""
+def viewpoint(maze: MazeMap, aspect: float = LANDSCAPE) -> tuple[Point, Point]:
+    """The first position of the camera, and the point it looks at: all of the maze is in view.
+
+    Args:
+        maze: The maze.
+        aspect: Width of the picture by its height. A telephone held upright has the maze in the
+            upper two fifths, as the panel lies over the others.
+    """
     xmin, xmax, ymin, ymax = maze.extent
     x, y = (xmin + xmax) / 2, (ymin + ymax) / 2
-    size = max(xmax - xmin, ymax - ymin)
-    return (x, y - 0.2 * size, 0.66 * size), (x, y, 0.0)
+    # The near edge has to fit into a vertical field of view of 75 degrees.
+    distance = max(xmax - xmin, ymax - ymin) * max(0.8, 0.16 + 0.68 / aspect)
+    if aspect < 2 / 3:
+        distance /= 1.16  # the maze is farther off than the point looked at, by the next line
+        y -= 0.56 * distance
+    return (x, y - 0.29 * distance, 0.957 * distance), (x, y, 0.0)
+
+
+def aim(camera: Any, position: Point, target: Point) -> None:
+    """Put a camera of viser somewhere, and turn it to a point."""
+    camera.position = np.array(position)
+    camera.look_at = np.array(target)
 
 
 def floor_point(origin: Sequence[float], direction: Sequence[float]) -> tuple[float, float] | None:

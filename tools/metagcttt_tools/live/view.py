@@ -2,8 +2,10 @@
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import redirect_stdout
 from datetime import datetime, UTC
 from functools import partial
+import io
 import os
 from pathlib import Path
 import queue
@@ -18,6 +20,7 @@ from metagcttt_core.robot import ContractError
 from metagcttt_interfaces.msg import PolicyStatus
 import rclpy
 from rclpy.signals import SignalHandlerOptions
+from sim_bridge import MazeMap
 import torch
 import viser
 
@@ -25,7 +28,7 @@ from metagcttt_tools.graph.process import NodeFailedError, NodeProcess
 from metagcttt_tools.live.panel import Controls, GraphControls, Panel, Player
 from metagcttt_tools.live.picture import Picture
 from metagcttt_tools.live.replay import Replay
-from metagcttt_tools.live.scene import floor_point
+from metagcttt_tools.live.scene import aim, floor_point, viewpoint
 from metagcttt_tools.live.watch import RefusedError, Watch
 
 _REFRESH_S = 0.1
@@ -62,14 +65,17 @@ class Window:
         self._pool = ThreadPoolExecutor(1)
         with socket.create_server((host, 0)):
             pass  # viser would wait forever at an address that this machine does not have
-        self.server = _Server(host, port, label='Meta-GC-TTT', verbose=False)
+        with redirect_stdout(io.StringIO()):  # viser prints a box around what `url` says
+            self.server = _Server(host, port, label='Meta-GC-TTT', verbose=False)
         self.url = f'http://{host}:{self.server.get_port()}'
         self.server.gui.configure_theme(
             control_layout='fixed', show_logo=False, show_share_button=False
         )
         self.panel = Panel(self.server.gui, hint)
         self._picture: Picture | None = None
+        self._maze: MazeMap | None = None
         self._losses_of: Any = None
+        self.server.on_client_connect(self._keep_all_in_view)
 
     def close(self) -> None:
         """Stop the server."""
@@ -93,11 +99,40 @@ class Window:
             if self._picture is not None:
                 self._picture.close()
             self._picture = Picture(self.server, seen, self._pool)
+            self._show_all_of(self._picture.maze)
         with self.server.atomic():
             self._picture.refresh()
         if self._picture.fault:
             self.panel.say(f'⚠️ {self._picture.fault}')
             self._picture.fault = ''
+
+    def _show_all_of(self, maze: MazeMap) -> None:
+        """Turn every camera to another maze; one that was seen before stays as it was turned."""
+        before, self._maze = self._maze, maze
+        if before is None or before.extent != maze.extent:
+            for client in self.server.get_clients().values():
+                self._aim(client)
+
+    def _keep_all_in_view(self, client: viser.ClientHandle) -> None:
+        """Turn the camera of a browser to the maze now, and when its picture takes another shape.
+
+        A browser reports the shape of an empty page before that of the scene.
+        """
+        aspect = 0.0
+
+        def fit(camera: viser.CameraHandle) -> None:
+            nonlocal aspect
+            if camera.aspect != aspect:
+                aspect = camera.aspect
+                self._aim(client)
+
+        client.camera.on_update(fit)
+        fit(client.camera)
+
+    def _aim(self, client: viser.ClientHandle) -> None:
+        """Turn the camera of a browser so that all of the maze fits."""
+        if self._maze is not None:
+            aim(client.camera, *viewpoint(self._maze, client.camera.aspect))
 
 
 class LiveView:
@@ -146,6 +181,7 @@ class LiveView:
         )
         self._next_refresh_s = self._next_settings_s = 0.0
         self._recorder: NodeProcess | None = None
+        self._silence = ''
 
     def run(self) -> None:
         """Show the graph until an exception ends it, such as that of a signal."""
@@ -153,7 +189,7 @@ class LiveView:
             self._watch.spin(0.05)
             self._while_waiting()
             if time.monotonic() > self._next_settings_s:
-                self._do(self._watch.read_settings)
+                self._read_settings()
                 self._next_settings_s = time.monotonic() + _SETTINGS_S
             while not self._jobs.empty():
                 self._do(self._jobs.get())
@@ -168,12 +204,24 @@ class LiveView:
 
     # --- from the browser --------------------------------------------------------------------
 
-    def _do(self, job: Callable[[], None]) -> None:
-        """Do what was asked; that a node refuses it or is gone is shown and ends nothing."""
+    def _do(self, job: Callable[[], None]) -> str:
+        """Do what was asked; that a node refuses it or is gone is shown and ends nothing.
+
+        Returns:
+            What is shown of that; empty when it was done.
+        """
         try:
             job()
         except (NoAnswerError, RefusedError, NodeFailedError, ContractError) as error:
-            self._panel.say(f'⚠️ {error}')
+            self._panel.say(shown := f'⚠️ {error}')
+            return shown
+        return ''
+
+    def _read_settings(self) -> None:
+        """Read the nodes' settings; that one did not answer is forgotten once it does."""
+        before, self._silence = self._silence, self._do(self._watch.read_settings)
+        if before and not self._silence:
+            self._panel.take_back(before)
 
     def _send(self, xy: tuple[float, float] | None) -> None:
         if xy is None:
