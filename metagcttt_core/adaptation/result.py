@@ -32,6 +32,7 @@ class Adaptation:
         support: The transitions it was adapted on, with the time the filter took; None where no
             filter ran.
         seconds: Time the inner loop took.
+        adapter: Name of the service that adapted it; empty for this process.
     """
 
     agent: Agent
@@ -42,6 +43,7 @@ class Adaptation:
     engine: str = ''
     support: SupportSet | None = None
     seconds: float = 0.0
+    adapter: str = ''
 
     @property
     def accepted(self) -> bool:

@@ -9,7 +9,7 @@ import threading
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 
 from domain_coordinator import domain_id
-from metagcttt.policy import deployment
+from metagcttt import deployment
 from metagcttt_core import make_agent, save_checkpoint, TrajectoryDataset
 from metagcttt_tools.graph.process import NodeProcess
 import pytest

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from geometry_msgs.msg import Twist, TwistStamped
+from metagcttt.adapter.node import AdapterNode
 from metagcttt.goal.node import GoalNode
 from metagcttt.policy.node import PolicyNode
 from metagcttt.recorder.node import RecorderNode
@@ -22,6 +23,7 @@ from tests.ros.graph import ANY, EVERY, Graph
 
 CONTRACT = Path(__file__).parents[2] / 'config' / 'robots' / 'turtlebot3.yaml'
 NODES = {
+    'adapter_node': AdapterNode,
     'goal_node': GoalNode,
     'policy_node': PolicyNode,
     'recorder_node': RecorderNode,

@@ -20,7 +20,7 @@ import yaml
 PACKAGE = Path(__file__).parents[2] / 'ros2_ws' / 'src' / 'metagcttt'
 FILES = ('lifecycle', 'metagcttt', 'two_robots')
 OPTIONAL = {'recorder_node', 'visualization_node'}
-OF_A_MAZE = TABLES.keys() - {'robot_bridge_node'}
+OF_A_MAZE = TABLES.keys() - {'adapter_node', 'robot_bridge_node'}
 
 
 class Recorder:
@@ -247,6 +247,13 @@ def test_no_argument_masks_the_parameter_file_unless_it_is_given(launch, file: s
     for node in launch(file).nodes.values():
         parts = [part for part in node.kwargs.get('parameters', []) if isinstance(part, dict)]
         assert {key for part in parts for key in part} <= theirs
+
+
+@pytest.mark.parametrize('file', ['metagcttt', 'lifecycle'])
+def test_policy_is_told_of_the_adapter(launch, file: str) -> None:
+    policy = launch(file, adapter='/adapt').nodes['policy_node']
+    parts = [part for part in policy.kwargs['parameters'] if isinstance(part, dict)]
+    assert [part['adapter'].args for part in parts if 'adapter' in part] == [('/adapt',)]
 
 
 def test_an_argument_that_is_given_becomes_a_parameter_of_every_node_that_has_it(launch) -> None:

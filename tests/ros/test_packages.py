@@ -10,7 +10,7 @@ import pytest
 SOURCES = Path(__file__).parents[2] / 'ros2_ws' / 'src'
 ROOT = SOURCES.parents[1]
 # Not ROS packages; ros2_ws/README.md says how Python gets them.
-FROM_PIP = {'mcap', 'metagcttt_core', 'sim_bridge', 'torch'}
+FROM_PIP = {'mcap', 'metagcttt_core', 'pydantic', 'sim_bridge', 'torch'}
 KEYS = {'numpy': 'python3-numpy', 'yaml': 'python3-yaml'}
 
 

@@ -87,6 +87,16 @@ def test_stopped_run_saves_every_step_so_far(tmp_path: Path) -> None:
     assert len(load_file(tmp_path / 'checkpoint.safetensors')['replay.rewards']) == 7
 
 
+def test_run_out_of_time_saves_and_asks_to_be_queued_again(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit) as ended:
+        train(tmp_path, 40, '--time-limit', '1e-9')
+    assert ended.value.code == 75
+    steps = len(load_file(tmp_path / 'checkpoint.safetensors')['replay.rewards'])
+    assert 0 < steps < 40
+    train(tmp_path, 40, '--resume', '--time-limit', '1e6')
+    assert LearnedFollower.load(tmp_path / 'controller').metadata['steps'] == 40
+
+
 def test_learning_rate_falls_to_zero_over_the_last_steps(tmp_path: Path) -> None:
     sac = {'batch_size': 8, 'actor_hidden': (8,), 'critic_hidden': (8,), 'lr': 0.1}
     settings = TrainControllerSettings(

@@ -51,6 +51,16 @@ def test_finished_run_is_not_trained_over(
     assert load_follower(trained / 'controller').sha256 == before
 
 
+def test_run_out_of_time_saves_and_asks_to_be_queued_again(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit) as ended:
+        train(tmp_path, '--time-limit', '1e-9')
+    assert ended.value.code == 75
+    assert (tmp_path / 'checkpoint.safetensors').exists()
+    with pytest.raises(SystemExit, match='75'):  # a sweep at a time
+        train(tmp_path, '--time-limit', '1e-9', '--resume')
+    assert load_follower(tmp_path / 'controller').metadata['sweeps'] == 2
+
+
 def test_other_seed_is_another_run(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         train(trained, '--resume', '--seed', '5')

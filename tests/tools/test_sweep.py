@@ -239,6 +239,14 @@ def test_a_run_that_fails_ends_the_study_with_its_message(preset, capsys):
     assert 'missing.npz: no such file' in capsys.readouterr().err
 
 
+def test_a_study_out_of_time_asks_to_be_queued_again(preset, tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        sweep.main(['--preset', str(preset), '--time-limit', '1e-9'])
+    assert ended.value.code == 75
+    assert 'run the same command to continue' in capsys.readouterr().err
+    assert not (tmp_path / 'study' / 'evaluation-full.json').exists()
+
+
 def test_an_evaluation_is_done_once_it_is_there_with_the_same_settings(preset):
     evaluation, _ = study_of(preset).evaluations['full']
     assert not is_evaluated(evaluation)

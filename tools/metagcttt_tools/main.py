@@ -66,6 +66,7 @@ PROGRAMS: dict[str, Program | Group] = {
     'top-view': Program('top_view', 'Draw a recording from above, or film it.'),
     'benchmark': Group(
         {
+            'adapter': Program('benchmarks.adapter', 'Time of an expert where many robots ask.'),
             'cluster': Program('benchmarks.cluster', 'Overhead of Ray, and studies after kills.'),
             'inner-loop': Program(
                 'benchmarks.inner_loop', 'Milliseconds per inner step, and of JAX.'

@@ -27,6 +27,7 @@ setup(
         'console_scripts': [
             f'{node} = {NAME}.main:{node}'
             for node in (
+                'adapter_node',
                 'goal_node',
                 'policy_node',
                 'recorder_node',

@@ -4,8 +4,8 @@ from functools import partial
 from pathlib import Path
 import threading
 
+from metagcttt import deployment
 from metagcttt.goal_in_force import Goal
-from metagcttt.policy import deployment
 from metagcttt_core import adapt, FilterConfig, make_agent, save_checkpoint, TTTConfig
 from metagcttt_core.adaptation import AdaptationCancelled
 from metagcttt_core.agents.gciql import StateValue

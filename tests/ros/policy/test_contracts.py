@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from metagcttt.policy.deployment import load_deployment
+from metagcttt.deployment import load_deployment
 from metagcttt_core import FilterConfig, save_checkpoint, TrajectoryDataset
 import numpy as np
 import pytest

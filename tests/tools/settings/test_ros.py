@@ -7,7 +7,8 @@ from unittest import mock
 from metagcttt import commander
 import metagcttt_core
 from metagcttt_tools import demo
-from metagcttt_tools.benchmarks import restarts, ros, state_source
+from metagcttt_tools.benchmarks import adapter, restarts, ros, state_source
+from metagcttt_tools.benchmarks.fleet_robot import Outcome
 from metagcttt_tools.graph import drive
 from metagcttt_tools.graph import process as nodes
 from metagcttt_tools.live import replay
@@ -195,7 +196,63 @@ BENCHMARK_RESTARTS = Walk(
     watch_restarts,
 )
 
-WALKS = (EVALUATE_ROS, DEMO, VIEW, BENCHMARK_ROS, BENCHMARK_RESTARTS)
+
+def watch_adapter(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    """The processes are noted with what they are told."""
+
+    class Connection:
+        def send(self, order):
+            seen.append(order)
+
+        def recv(self):
+            return [Outcome('expert', 0, 1.0)]
+
+        def close(self):
+            pass
+
+    class Processes:
+        @staticmethod
+        def Pipe():
+            return Connection(), Connection()
+
+        @staticmethod
+        def Process(target, args, daemon):
+            seen.append(args[:3])
+            return mock.Mock()
+
+    def process(*given):
+        parameters = {name: value for name, value in given[1].items() if name != 'checkpoint'}
+        seen.append((given[0], parameters, given[2]))
+        return mock.MagicMock()
+
+    patch.setattr(adapter.multiprocessing, 'get_context', lambda _: Processes)
+    patch.setattr(nodes, 'NodeProcess', process)
+    patch.setattr(adapter, 'write_report', lambda path, *_: seen.append(path))
+    without_graph(patch)
+
+
+BENCHMARK_ADAPTER = Walk(
+    'benchmark adapter',
+    {'robots': 2, 'hidden': [4], 'steps': 1, 'batch_size': 8},
+    {
+        'out': 'elsewhere',
+        'robots': 3,
+        'duration_s': 7.0,
+        'goal_every_s': 7.0,
+        'rush_every_s': 7.0,
+        'workers': 3,
+        'rush_queue': 7,
+        'agent': 'gciql',
+        'hidden': [3],
+        'steps': 2,
+        'batch_size': 9,
+        'timeout_s': 7.0,
+        'seed': 1,
+    },
+    watch_adapter,
+)
+
+WALKS = (EVALUATE_ROS, DEMO, VIEW, BENCHMARK_ROS, BENCHMARK_RESTARTS, BENCHMARK_ADAPTER)
 
 
 @walks_through(WALKS)

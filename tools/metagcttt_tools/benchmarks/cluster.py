@@ -282,9 +282,17 @@ def _trainings(data: Path, folder: Path, steps: int, count: int) -> list[Job]:
 
 
 def parent_of(process: int) -> int:
-    """Id of the process that started another."""
+    """Id of the process that started another, which may be killed.
+
+    Raises:
+        RuntimeError: If that one has ended, so that the first process of the machine, or none,
+            stands in its place.
+    """
     fields = Path(f'/proc/{process}/stat').read_text(encoding='utf-8').rpartition(')')[2].split()
-    return int(fields[1])
+    parent = int(fields[1])
+    if parent <= 1:
+        raise RuntimeError(f'process {process} has lost the process that started it')
+    return parent
 
 
 def _random_walks(path: Path) -> Path:

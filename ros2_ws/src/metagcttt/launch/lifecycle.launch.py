@@ -33,7 +33,7 @@ def policy(context: LaunchContext) -> list[Action]:
         parameters=[
             LaunchConfiguration('params_file'),
             {'autostart': False},
-            given(context, 'checkpoint', 'dataset', 'use_sim_time'),
+            given(context, 'checkpoint', 'dataset', 'adapter', 'use_sim_time'),
         ],
         **shared | {'on_exit': Respawns(0).on_exit},
     )

@@ -37,7 +37,11 @@ def nodes(context: LaunchContext) -> list[Node]:
         LifecycleNode(
             executable='policy_node',
             name='policy_node',
-            parameters=[params_file, given(context, 'dataset', 'checkpoint', 'autostart'), clock],
+            parameters=[
+                params_file,
+                given(context, 'dataset', 'checkpoint', 'autostart', 'adapter'),
+                clock,
+            ],
             condition=IfCondition(LaunchConfiguration('policy')),
             **shared,
         ),

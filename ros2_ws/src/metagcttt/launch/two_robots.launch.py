@@ -18,8 +18,8 @@ from metagcttt.launch_arguments import declare, given, respawning, SHARE
 
 ROBOTS = ('robot1', 'robot2')
 SHARED = (
-    *('stepping', 'params_file', 'environment', 'dataset', 'autostart', 'use_sim_time'),
-    *('visualize', 'respawn_limit', 'log_level'),
+    *('stepping', 'params_file', 'environment', 'dataset', 'autostart', 'adapter'),
+    *('use_sim_time', 'visualize', 'respawn_limit', 'log_level'),
 )
 
 CHECKPOINTS = {

@@ -60,6 +60,10 @@ _ARGUMENTS: dict[str, dict[str, Any]] = {
         'choices': ['', *_FLAG],
         'description': f'whether the policy node configures and activates itself; {_ELSE}',
     },
+    'adapter': {
+        'default_value': '',
+        'description': f'service of an adapter_node that adapts for the policy node; {_ELSE}',
+    },
     'use_sim_time': {
         'default_value': 'true',
         'choices': _FLAG,

@@ -29,6 +29,15 @@ def _executable(main: Callable[[threading.Event], int]) -> Callable[[], int]:
 
 
 @_executable
+def adapter_node(stop: threading.Event) -> int:
+    """Run the adapter of many robots until Ctrl-C or SIGTERM; returns the exit code."""
+    from metagcttt.adapter.node import AdapterNode
+    from metagcttt.running import run
+
+    return run(AdapterNode, stop, farewell=AdapterNode.end_service)
+
+
+@_executable
 def goal_node(stop: threading.Event) -> int:
     """Run the goal node until Ctrl-C or SIGTERM; returns the exit code."""
     from metagcttt.goal.node import GoalNode

@@ -18,6 +18,30 @@ DIAGNOSTICS_PERIOD_S = Parameter(
 )
 CHECKPOINT = Parameter('checkpoint', '', 'folder of the policy; empty: the committed one')
 DATASET = Parameter('dataset', '', 'dataset file (.npz); empty: the committed one')
+FILTER = (
+    Parameter(
+        'filter_variant',
+        'gcttt',
+        'rule that selects the sub-trajectories to adapt on',
+        choices=('gcttt', 'paper'),
+        changes='configure',
+    ),
+    Parameter(
+        'epsilon',
+        0.0,
+        'distance within which a trajectory has to pass the robot to be relevant, metres; 0: that '
+        "of the robot's contract, or 1",
+        (0, 1000),
+        changes='configure',
+    ),
+    Parameter(
+        'top_percent',
+        20.0,
+        'share of the relevant trajectories to keep, percent',
+        (0.001, 100),
+        changes='configure',
+    ),
+)
 
 GOAL_NODE = (
     Parameter(
@@ -112,6 +136,42 @@ SIM_BRIDGE_NODE = (
     Parameter('start_paused', False, 'start paused, until the service pause resumes'),
 )
 
+ADAPTER_NODE = (
+    DIAGNOSTICS_PERIOD_S,
+    CHECKPOINT,
+    DATASET,
+    *(replace(parameter, changes='start') for parameter in FILTER),
+    Parameter('workers', 1, 'adaptations at the same time, each in a thread', (1, 256)),
+    Parameter(
+        'queue',
+        20,
+        'requests that wait for a worker at most; further ones are refused',
+        (0, 10000),
+    ),
+    Parameter(
+        'robots',
+        100,
+        'robots served at most; one that is gone for a minute leaves its place',
+        (1, 10000),
+    ),
+    Parameter(
+        'max_steps', 1000, 'gradient steps that a request may ask for', (1, 10**6), changes='now'
+    ),
+    Parameter(
+        'max_batch_size',
+        4096,
+        'transitions per gradient step that a request may ask for',
+        (1, 10**6),
+        changes='now',
+    ),
+    Parameter(
+        'threads',
+        1,
+        "PyTorch threads of each adaptation; 0: PyTorch's default",
+        (0, 256),
+    ),
+)
+
 POLICY_NODE = (
     DIAGNOSTICS_PERIOD_S,
     Parameter('autostart', True, 'configure and activate at start-up'),
@@ -187,6 +247,26 @@ POLICY_NODE = (
         changes='now',
     ),
     Parameter(
+        'adapter',
+        '',
+        'service of an adapter_node that adapts instead of this node, such as /adapt; empty: none',
+        changes='configure',
+    ),
+    Parameter(
+        'adapter_timeout_s',
+        2.0,
+        'longest wait for an expert of the adapter, seconds',
+        (0.05, 3600),
+        changes='now',
+    ),
+    Parameter(
+        'adapter_fallback',
+        'local',
+        'without an expert of the adapter: adapt in this node, or act with the base policy',
+        choices=('local', 'base'),
+        changes='now',
+    ),
+    Parameter(
         'cache_size',
         0,
         'experts to cache for goals from the same cell to the same cell; 0: none',
@@ -200,28 +280,7 @@ POLICY_NODE = (
         (0.001, 1000),
         changes='configure',
     ),
-    Parameter(
-        'filter_variant',
-        'gcttt',
-        'rule that selects the sub-trajectories to adapt on',
-        choices=('gcttt', 'paper'),
-        changes='configure',
-    ),
-    Parameter(
-        'epsilon',
-        0.0,
-        'distance within which a trajectory has to pass the robot to be relevant, metres; 0: that '
-        "of the robot's contract, or 1",
-        (0, 1000),
-        changes='configure',
-    ),
-    Parameter(
-        'top_percent',
-        20.0,
-        'share of the relevant trajectories to keep, percent',
-        (0.001, 100),
-        changes='configure',
-    ),
+    *FILTER,
     Parameter(
         'rate_hz',
         20.0,
@@ -316,6 +375,7 @@ VISUALIZATION_NODE = (
 )
 
 TABLES = {
+    'adapter_node': ADAPTER_NODE,
     'goal_node': GOAL_NODE,
     'policy_node': POLICY_NODE,
     'recorder_node': RECORDER_NODE,

@@ -54,6 +54,7 @@ class Pursuit:
         adapting: Whether an adaptation is under way.
         adapted_at: Control step of the state that was last adapted to.
         progress: Of the newest adaptation.
+        fallback: Why it is not the adapter's, where there is one to ask; else empty.
     """
 
     goal: Goal
@@ -63,6 +64,7 @@ class Pursuit:
     adapting: bool = False
     adapted_at: int | None = None
     progress: Progress = field(default_factory=Progress)
+    fallback: str = ''
 
     def serves(self, state: State) -> bool:
         """True when the goal counts in `state`."""

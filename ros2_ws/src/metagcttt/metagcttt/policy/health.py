@@ -2,12 +2,19 @@
 
 import time
 
+from metagcttt_core import Adaptation
+
 from metagcttt.health import Deadlines, Faults, Health, Level, Rate, Samples
 from metagcttt.policy.decision import Pursuit
 
 
 class PolicyMonitor:
-    """Collects statistics while a policy runs and judges its health."""
+    """Collects statistics while a policy runs and judges its health.
+
+    Attributes:
+        adapter: Name of the service that adapts; empty where this node does.
+        num_fallbacks: Goals for which that service had no expert.
+    """
 
     def __init__(self, engine: str) -> None:
         """Start with empty statistics.
@@ -16,12 +23,21 @@ class PolicyMonitor:
             engine: What computes gradient steps; `Adaptation.engine`.
         """
         self.engine = engine
+        self.adapter = ''
+        self.num_fallbacks = 0
+        self._num_remote = 0
         self.states = Rate()
         self.actions = Rate()
         self.latency_ms = Samples()
         self.adapt_ms = Samples(100)
         self.deadlines = Deadlines()
         self.faults = Faults()
+
+    def adapted(self, adaptation: Adaptation) -> None:
+        """Record an adaptation that ended without an error."""
+        self.adapt_ms.add(1000 * adaptation.seconds)
+        self.engine = adaptation.engine or self.engine
+        self._num_remote += bool(adaptation.adapter)
 
     def examine(
         self,
@@ -63,6 +79,7 @@ class PolicyMonitor:
             'adapt_p99_ms': f'{self.adapt_ms.percentile(99):.1f}',
             'adaptations_pending': str(num_pending),
             'action_publishers': str(num_publishers),
+            **self._adapter_values(),
             **{kind: str(count) for kind, count in sorted(self.faults.counts.items())},
         }
         level, message = Level.OK, 'acting with the adapted policy'
@@ -84,7 +101,18 @@ class PolicyMonitor:
             message = 'no goal'
         elif base_reason:
             level, message = Level.WARN, f'acting with the base policy: {base_reason}'
+        elif pursuit.fallback:
+            level, message = Level.WARN, f'without the adapter: {pursuit.fallback}'
         return Health(level, message, values)
+
+    def _adapter_values(self) -> dict[str, str]:
+        if not self.adapter:
+            return {}
+        return {
+            'adapter': self.adapter,
+            'adapter_experts': str(self._num_remote),
+            'adapter_fallbacks': str(self.num_fallbacks),
+        }
 
 
 def _base_reason(pursuit: Pursuit | None) -> str:

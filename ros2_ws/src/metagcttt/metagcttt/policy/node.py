@@ -4,20 +4,21 @@ import secrets
 import traceback
 from typing import Any
 
-from metagcttt_core import FilterConfig
 from metagcttt_core.training.numerics import resolve_precision
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.exceptions import NameValidationException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from rclpy.validate_topic_name import validate_topic_name
 from std_srvs.srv import SetBool
 import torch
 
 from metagcttt.conventions import ConventionalNode
+from metagcttt.deployment import deployment_of, warm_up
 from metagcttt.diagnostics import Diagnostics
 from metagcttt.health import Health, Level
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import POLICY_NODE
-from metagcttt.policy.deployment import load_deployment, warm_up
 from metagcttt.policy.session import inner_loop, PolicySession
 
 
@@ -81,20 +82,12 @@ class PolicyNode(ConventionalNode, LifecycleNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load policy and dataset, and connect; a failure leaves the node unconfigured."""
         try:
-            config = FilterConfig(
-                variant=self._settings['filter_variant'],
-                epsilon=self._settings['epsilon'] or 1.0,
-                top_percent=self._settings['top_percent'],
-            )
-            deployment = load_deployment(
-                self._settings['checkpoint'],
-                self._settings['dataset'],
-                config,
-                epsilon_of_contract=not self._settings['epsilon'],
-            )
+            deployment = deployment_of(self._settings)
+            if self._settings['adapter']:
+                validate_topic_name(self._settings['adapter'], is_service=True)
             deployment.check_optimizer_state(self._settings['optimizer_state'])
             engine = warm_up(deployment, inner_loop(self._settings))
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, NameValidationException) as error:
             # rclpy would swallow it silently.
             self._failure = f'cannot configure: {error}'
             self.get_logger().error(self._failure)

@@ -2,52 +2,18 @@
 
 import time
 
-from builtin_interfaces.msg import Time
 from metagcttt_core import Adaptation
 from metagcttt_interfaces.msg import ActionCommand, AdaptationReport, PolicyStatus
 from rclpy.lifecycle import LifecycleNode
 from std_msgs.msg import Header
 
-from metagcttt.converters import action_message, to_floats
+from metagcttt.adaptation_messages import report_message
+from metagcttt.converters import action_message
 from metagcttt.goal_in_force import Goal
 from metagcttt.policy.decision import Command, Pursuit, State
 from metagcttt.qos import COMMAND, EVENTS, keep_several, LATCHED, RECORDED_DEPTH
 
 STATUS_PERIOD_S = 0.2
-
-
-def report_message(
-    stamp: Time, goal: Goal, adaptation: Adaptation, *, cached: bool = False
-) -> AdaptationReport:
-    """The report on an adaptation.
-
-    Args:
-        stamp: Time of the report.
-        goal: The goal that was adapted to.
-        adaptation: The result; without a support where the filter did not run.
-        cached: The expert was adapted for an earlier goal, so no time was spent on this one.
-    """
-    message = AdaptationReport(
-        header=Header(stamp=stamp),
-        query_id=goal.query_id,
-        episode_id=goal.episode_id,
-        adapt_ms=0.0 if cached else 1000.0 * adaptation.seconds,
-        steps=len(adaptation.train_losses),
-        train_losses=to_floats(adaptation.train_losses),
-        test_losses=to_floats(adaptation.test_losses),
-        best_step=int(adaptation.best_step),
-        accepted=bool(adaptation.accepted),
-        cached=cached,
-        reason=adaptation.reason,
-    )
-    if (support := adaptation.support) is not None:
-        message.relevant_trajectories = int(support.num_relevant)
-        message.kept_trajectories = int(support.num_kept)
-        message.transitions = int(support.num_transitions)
-        message.filter_ms = 0.0 if cached else float(support.milliseconds)
-        message.segment_starts = [int(start) for start, _ in support.segments]
-        message.segment_stops = [int(stop) for _, stop in support.segments]
-    return message
 
 
 class PolicyPublishers:
@@ -91,14 +57,17 @@ class PolicyPublishers:
             )
         )
 
-    def publish_report(self, goal: Goal, adaptation: Adaptation, *, cached: bool = False) -> None:
-        """Publish and log the result of an adaptation."""
+    def publish_report(
+        self, goal: Goal, adaptation: Adaptation, *, cached: bool = False, remark: str = ''
+    ) -> None:
+        """Publish and log the result of an adaptation; see `report_message`."""
         report = report_message(
-            self._node.get_clock().now().to_msg(), goal, adaptation, cached=cached
+            self._node.get_clock().now().to_msg(), goal, adaptation, cached=cached, remark=remark
         )
         self._reports.publish(report)
         verdict = f'adapted in {report.adapt_ms:.0f} ms' if report.accepted else 'not adapted'
         verdict = 'adapted before' if cached else verdict
+        verdict += f' by {report.adapter}' if report.adapter else ''
         self._node.get_logger().info(
             f'goal {goal.query_id}: {report.transitions} transitions from '
             f'{report.kept_trajectories} of {report.relevant_trajectories} trajectories '

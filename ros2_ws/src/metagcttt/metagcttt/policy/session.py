@@ -9,12 +9,12 @@ from rclpy.timer import Timer
 
 from metagcttt.clocks import JumpFreeClock, STEADY
 from metagcttt.converters import to_array, to_goal
+from metagcttt.deployment import Deployment
 from metagcttt.health import Health
 from metagcttt.input_checks import vector_fault
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.policy.adapter import GoalAdapter
 from metagcttt.policy.decision import decide, Pursuit, State
-from metagcttt.policy.deployment import Deployment
 from metagcttt.policy.health import PolicyMonitor
 from metagcttt.policy.publishers import PolicyPublishers
 from metagcttt.policy.safety import Safety
@@ -92,7 +92,13 @@ class PolicySession:
         self._safety = Safety(enabled=enabled)
         self._publishers = PolicyPublishers(node, instance)
         self._adapter = GoalAdapter(
-            node, settings, deployment, self._publishers, self._monitor, self._proceed
+            node,
+            settings,
+            deployment,
+            self._publishers,
+            self._monitor,
+            self._proceed,
+            instance,
         )
         self._watchdog = node.create_timer(WATCHDOG_PERIOD_S, self._on_watchdog, clock=STEADY)
         profile = state_profile(settings['stepping'])
@@ -236,6 +242,7 @@ class PolicySession:
 
     def _on_watchdog(self) -> None:
         """Check the inputs for timeouts; on a steady clock, as the node's may stand still."""
+        self._adapter.check_time()
         pursuit = self._pursuit
         if pursuit and self._safety.expire_goal(pursuit.goal.query_id, time.monotonic()):
             self._node.get_logger().error(self._safety.expired_goal)

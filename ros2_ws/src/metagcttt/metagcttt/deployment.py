@@ -2,7 +2,9 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from functools import cached_property
+import hashlib
+from typing import Any, Protocol
 
 from metagcttt_core import (
     adapt,
@@ -28,11 +30,43 @@ from metagcttt.goal_in_force import Goal
 
 
 @dataclass(frozen=True)
+class Identity:
+    """What decides, besides goal, state, seed and inner loop, which expert comes out.
+
+    Attributes:
+        checkpoint: Fingerprint of the base policy: weights, scaling, settings, optimiser state.
+        dataset: Fingerprint of the dataset.
+        filter: Settings of the filter as JSON.
+    """
+
+    checkpoint: str
+    dataset: str
+    filter: str
+
+
+@dataclass(frozen=True)
 class Deployment:
     """A base policy and the indexed dataset it adapts on; they fit together."""
 
     agent: Agent
     trajectory_filter: TrajectoryFilter
+
+    @cached_property
+    def identity(self) -> Identity:
+        """Its identity; reads all weights and rows the first time."""
+        agent = self.agent
+        digest = hashlib.blake2b(digest_size=8)
+        digest.update(f'{agent.name} {agent.settings.model_dump_json()}'.encode())
+        digest.update(agent.fingerprint().encode())
+        for number, state in (agent.optimizer_state or {}).items():
+            for name, values in state.items():
+                digest.update(f'{number}.{name}{tuple(values.shape)}'.encode())
+                digest.update(values.cpu().numpy().tobytes())
+        return Identity(
+            checkpoint=digest.hexdigest(),
+            dataset=self.dataset.fingerprint,
+            filter=self.trajectory_filter.config.model_dump_json(),
+        )
 
     @property
     def contract(self) -> Mapping[str, Any] | None:
@@ -116,6 +150,28 @@ def load_deployment(
         changes['epsilon'] = contract.get('epsilon')
     given = {name: value for name, value in changes.items() if value}
     return Deployment(agent, TrajectoryFilter(data, FilterConfig(**config.model_dump() | given)))
+
+
+class Values(Protocol):
+    """Values by name, such as the parameters of a node."""
+
+    def __getitem__(self, name: str) -> Any:
+        """The value of that name."""
+
+
+def deployment_of(parameters: Values) -> Deployment:
+    """Load what a node's parameters name; see `load_deployment`."""
+    config = FilterConfig(
+        variant=parameters['filter_variant'],
+        epsilon=parameters['epsilon'] or 1.0,
+        top_percent=parameters['top_percent'],
+    )
+    return load_deployment(
+        parameters['checkpoint'],
+        parameters['dataset'],
+        config,
+        epsilon_of_contract=not parameters['epsilon'],
+    )
 
 
 def warm_up(deployment: Deployment, config: TTTConfig) -> str:
