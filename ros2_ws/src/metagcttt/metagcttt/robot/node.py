@@ -145,7 +145,7 @@ class RobotBridgeNode(ConventionalNode):
         if refusal:
             self._note('refused_actions', refusal)
         else:
-            self._act(due=False)
+            self._act(due=self._pilot.repeats)
 
     def _on_stop(self, message: Bool) -> None:
         if message.data:

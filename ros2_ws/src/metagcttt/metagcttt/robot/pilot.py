@@ -43,6 +43,7 @@ class Pilot:
     Attributes:
         stopped: Why the robot is stopped, until it is cleared; empty when it is not.
         fault: Why there must be no command now, such as a late topic; set by the owner.
+        repeats: Whether the newest action only repeats the answer to the same observation.
     """
 
     def __init__(self, contract: Contract) -> None:
@@ -54,6 +55,7 @@ class Pilot:
         self._action: _Action | None = None
         self.stopped = ''
         self.fault = ''
+        self.repeats = False
 
     def saw_observation(self, step: int, observation: NDArray[np.float64], now_ns: int) -> None:
         """Remember when an observation was made, which limits the age of its action."""
@@ -78,7 +80,11 @@ class Pilot:
         observed_ns, observation = self._steps[step]
         if self._action is not None and observed_ns < self._action.observed_ns:
             return f'the action for step {step} came after that for a newer one'
+        last = self._action
         self._action = _Action(values, withheld, query_id, observed_ns, observation)
+        self.repeats = last is not None and (
+            (last.observed_ns, last.query_id, last.withheld) == (observed_ns, query_id, withheld)
+        )
         return ''
 
     def forget(self) -> None:
