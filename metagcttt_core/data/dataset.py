@@ -13,7 +13,7 @@ from metagcttt_core.data import checks, minari, npz
 from metagcttt_core.data.errors import DatasetError
 
 _CHUNK_ROWS = 1 << 20
-_CONTRACT = 'contract'
+CONTRACT = 'contract'
 """Name of the text in an npz file that holds the contract as JSON."""
 
 
@@ -153,7 +153,7 @@ class TrajectoryDataset:
         ends = checks.take_ends(arrays, str(path))
         observations, actions = arrays.pop('observations'), arrays.pop('actions')
         following = arrays.pop('next_observations', None)
-        contract = None if minari.is_minari(path) else npz.read_json(path, _CONTRACT)
+        contract = None if minari.is_minari(path) else npz.read_json(path, CONTRACT)
         dataset = cls.from_arrays(
             observations, actions, ends, arrays, source=path, contract=contract
         )
@@ -164,7 +164,7 @@ class TrajectoryDataset:
 
     def save(self, path: str | Path) -> None:
         """Write the dataset as OGBench's compressed npz, atomically; the inverse of `load`."""
-        about = {_CONTRACT: np.array(json.dumps(self.contract))} if self.contract else {}
+        about = {CONTRACT: np.array(json.dumps(self.contract))} if self.contract else {}
         npz.write_arrays(
             Path(path),
             {

@@ -53,7 +53,8 @@ class Limits:
         self, target: NDArray[np.float64], last: NDArray[np.float64], seconds: float
     ) -> NDArray[np.float64]:
         """The command nearest to `target` that is in reach of the last one within `seconds`."""
-        reach = self.max_rates * seconds
+        reach = np.full_like(self.max_rates, np.inf)
+        np.multiply(self.max_rates, seconds, out=reach, where=np.isfinite(self.max_rates))
         return np.clip(target, last - reach, last + reach)
 
 

@@ -10,12 +10,13 @@ import sys
 import time
 
 import metagcttt_core
-from metagcttt_core import adapt, load_checkpoint, save_checkpoint
+from metagcttt_core import adapt, load_checkpoint, save_checkpoint, TrajectoryDataset
 from metagcttt_tools import evaluate, meta_train, pack_assets, pretrain
 from metagcttt_tools.common.cli import parse
 import numpy as np
 import pytest
 from tests.core.builders import maze_walks
+from tests.core.robot.messages import contract
 from tests.tools.tables import squeezed
 import torch
 
@@ -272,6 +273,19 @@ def test_packed_policies_have_their_optimizer_state_when_asked(kept, dataset_pat
     pack_assets.main([*arguments, '--optimizer-state'] if kept else arguments)
     agent = load_checkpoint(tmp_path / 'assets' / 'base')
     assert (agent.optimizer_state is not None) == kept
+
+
+def test_packed_data_keep_their_contract(dataset_path, base, tmp_path):
+    data = TrajectoryDataset.load(dataset_path)
+    identity = contract().identity
+    of_robot = TrajectoryDataset.from_arrays(
+        data.observations, data.actions, data.terminals, contract=identity
+    )
+    settings = pack_assets.PackSettings(out=tmp_path, episodes=1)
+    pack_assets.pack_dataset(of_robot, settings)
+    packed = TrajectoryDataset.load(tmp_path / 'dataset.npz')
+    assert packed.contract == identity
+    assert packed.num_episodes == 1
 
 
 @pytest.mark.mujoco

@@ -16,7 +16,9 @@ _DESCRIPTION = """Turn bags of a robot into a dataset (.npz), by its contract.
 
 Example: metagcttt import-bags --contract config/robots/turtlebot3.yaml --bags drive.mcap
 A row a control period; the action is the first command after the observation. Where one of them
-is missing, the trajectory is cut. What was left out is printed."""
+is missing, the trajectory is cut, and after --longest-s where that is given: goals of a row are
+later ones of its trajectory, and the filter takes one stretch of each. What was left out is
+printed."""
 
 
 class BagSettings(Settings):
@@ -27,6 +29,9 @@ class BagSettings(Settings):
         (), description='recordings: folders of ros2 bag, .mcap or .db3 files'
     )
     namespace: str = Field('', description='namespace of the robot in the bags')
+    longest_s: float | None = Field(
+        None, gt=0, description='cut longer trajectories into several of so many seconds'
+    )
     out: Path = Field(Path('data/robot.npz'), description='dataset to write')
     overwrite: bool = Field(False, description='replace an existing dataset')
 
@@ -49,12 +54,15 @@ def _run(settings: BagSettings) -> None:
     datasets = []
     try:
         contract = load_contract(settings.contract)
+        longest = None
+        if settings.longest_s is not None:
+            longest = max(1, round(settings.longest_s * contract.rate_hz))
         for path in settings.bags:
             with open_bag(path, contract, settings.namespace) as bag:
                 if faults := bag_faults(contract, bag):
                     fail(*(f'{path}: {fault}' for fault in faults))
                 found = read_episodes(contract, bag.messages())
-                datasets.append(found.dataset())
+                datasets.append(found.dataset(longest))
             print(f'{path}\n{describe_bag(found)}')
             for count in found.counts.values():
                 if count.refused:

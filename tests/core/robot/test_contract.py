@@ -16,7 +16,7 @@ def test_starting_contracts_load():
     assert {name: (c.obs_dim, c.act_dim) for name, c in dims.items()} == {
         'arm4': (8, 4),
         'arm6': (12, 6),
-        'diffbot': (6, 2),
+        'diffbot': (4, 2),
         'diffdrive': (6, 2),
         'quadruped': (37, 12),
         'turtlebot3': (6, 2),

@@ -1,8 +1,10 @@
 """What goes wrong around the policy: a zero action, a diagnostic that says why, recovery."""
 
 from collections.abc import Callable
+import math
 from pathlib import Path
 
+from geometry_msgs.msg import Point
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 from metagcttt.converters import to_time
@@ -227,13 +229,16 @@ def test_goal_that_is_not_repeated_is_dropped_until_it_comes_again(make_rig) -> 
 
 def test_repeated_goal_is_the_same_goal(make_rig) -> None:
     rig = make_rig()
+    nowhere = Point(x=math.nan, y=math.nan)  # of a robot without a position
     for _ in range(5):
-        rig.goal(lease_s=5.0)
+        rig.goal(lease_s=5.0, position=nowhere)
         rig.drive()
     rig.graph.wait(lambda: rig.record.reports, 'the adaptation')
     rig.graph.wait_for(0.3)
     assert [report.query_id for report in rig.record.reports] == [1]
-    rig.goal(lease_s=5.0, goal=(19.0, 20.0))  # the same number, of a goal node that began anew
+    rig.goal(
+        lease_s=5.0, goal=(19.0, 20.0), position=nowhere
+    )  # the same number, of a goal node that began anew
     rig.graph.wait(lambda: len(rig.record.reports) == 2, 'the second adaptation')
 
 

@@ -91,6 +91,26 @@ def test_command_is_repeated_only_when_an_action_is_missing(pilot: Pilot) -> Non
     assert len(sent(pilot, 2 * STEP, due=True)) == 1
 
 
+def test_commands_are_in_reach_by_the_clock_of_the_robot(pilot: Pilot) -> None:
+    pilot.take_action(1, 7, FORWARD)
+    commands = [
+        pilot.commands(now_ns, due=False, robot_ns=robot_ns)[0][1].tolist()
+        for now_ns, robot_ns in ((STEP, STEP), (STEP + 1, 2 * STEP), (2 * STEP, 2 * STEP))
+    ]
+    assert commands[0] == pytest.approx([0.1, 1.0])  # 1 m/s^2, and no limit
+    assert commands[1] == commands[2] == pytest.approx([0.2, 1.0])  # then its time stands still
+
+
+def test_another_action_for_the_same_observation_only_repeats_the_answer(pilot: Pilot) -> None:
+    repeats = []
+    for query, withheld in ((7, True), (7, False), (7, False), (8, False), (8, False)):
+        pilot.take_action(1, query, FORWARD, withheld=withheld)
+        repeats.append(pilot.repeats)
+    pilot.saw_observation(2, np.zeros(4), STEP)
+    pilot.take_action(2, 8, FORWARD)
+    assert [*repeats, pilot.repeats] == [False, False, True, False, True, False]
+
+
 def test_observations_are_not_remembered_for_ever(pilot: Pilot) -> None:
     for step in range(2, 1002):
         pilot.saw_observation(step, np.zeros(4), step * STEP)

@@ -66,6 +66,18 @@ def test_drive_becomes_a_trajectory(contract_file, tmp_path, storage, compressio
     np.testing.assert_allclose(dataset.actions[:-1, 1], (0.1 * steps[:-1] - 1) / 2, atol=1e-6)
 
 
+def test_long_trajectory_is_cut_without_a_loss(contract_file, tmp_path):
+    bag = write(tmp_path / 'bag', drive())
+    whole = convert(contract_file, bag)
+    cut = convert(contract_file, bag, more=('--longest-s', '0.8'))
+    assert np.diff(cut.episode_ends, prepend=-1).tolist() == [9, 9, 4]  # 8, 8 and 3 transitions
+    starts = cut.episode_starts[1:]
+    np.testing.assert_array_equal(cut.observations[starts], cut.observations[starts - 1])
+    rows = np.setdiff1d(np.arange(cut.num_rows), cut.episode_ends)
+    np.testing.assert_array_equal(cut.observations[rows], whole.observations[:-1])
+    np.testing.assert_array_equal(cut.actions[rows], whole.actions[:-1])
+
+
 @pytest.mark.parametrize('storage', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
 def test_single_file_is_a_bag(contract_file, tmp_path, storage):
     bag = write(tmp_path / 'bag', drive(), storage)

@@ -152,6 +152,7 @@ IMPORT_BAGS = Walk(
         'contract': 'elsewhere.yaml',
         'bags': ['a.mcap', 'b.mcap'],
         'namespace': 'cart1',
+        'longest_s': 0.1,
         'out': 'elsewhere.npz',
         'overwrite': Proof(True, again=True),
     },

@@ -1,5 +1,6 @@
 """Trajectories from recorded messages of a robot, by its contract."""
 
+from bisect import bisect_right
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -63,18 +64,28 @@ class Episodes:
     late: dict[str, int] = field(default_factory=dict)
     trajectories: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
 
-    def dataset(self) -> TrajectoryDataset:
+    def dataset(self, longest: int | None = None) -> TrajectoryDataset:
         """All trajectories.
+
+        Args:
+            longest: Most transitions of a trajectory; longer ones are cut into several, of which
+                one begins in the row where the one before ends, so that no transition is lost.
 
         Raises:
             DatasetError: If there is none.
         """
         if not self.trajectories:
             raise DatasetError('no control period has both an observation and a command')
+        pieces = [
+            (observations[start : start + step + 1], actions[start : start + step + 1])
+            for observations, actions in self.trajectories
+            for step in [longest or len(actions) - 1]
+            for start in range(0, len(actions) - 1, step)
+        ]
         return TrajectoryDataset.from_arrays(
-            np.concatenate([observations for observations, _ in self.trajectories]),
-            np.concatenate([actions for _, actions in self.trajectories]),
-            np.concatenate([np.arange(len(o)) == len(o) - 1 for o, _ in self.trajectories]),
+            np.concatenate([observations for observations, _ in pieces]),
+            np.concatenate([actions for _, actions in pieces]),
+            np.concatenate([np.arange(len(o)) == len(o) - 1 for o, _ in pieces]),
         )
 
 
@@ -100,7 +111,7 @@ class _Commands:
 
     def between(self, start_ns: int, stop_ns: int) -> np.ndarray | None:
         """The first command of a control period, else the one still in force at its start."""
-        index = int(np.searchsorted(self._times_ns, start_ns, side='right'))
+        index = bisect_right(self._times_ns, start_ns)
         if index < len(self._times_ns) and self._times_ns[index] <= stop_ns:
             return self._actions[index]
         if index and start_ns - self._times_ns[index - 1] <= self._timeout_ns:

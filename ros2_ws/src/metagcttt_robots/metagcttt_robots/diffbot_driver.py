@@ -1,9 +1,12 @@
 """Drives a robot with two wheels to random goals of its map, by pure pursuit with noise."""
 
+from typing import Any
+
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import OccupancyGrid, Odometry
 import numpy as np
 from numpy.typing import NDArray
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 
 from metagcttt_robots.planner import inflate, shortest_path
@@ -17,14 +20,27 @@ STUCK_PERIODS = 40
 class DiffbotDriver(Node):
     """Answers every `odom` with a `cmd_vel`."""
 
-    def __init__(self) -> None:
-        """Wait for the map and the robot."""
-        super().__init__('diffbot_driver')
+    def __init__(self, **kwargs: Any) -> None:
+        """Wait for the map and the robot.
+
+        Args:
+            kwargs: For `rclpy.node.Node`.
+        """
+        super().__init__('diffbot_driver', **kwargs)
         self._speed = number(self, 'speed', 0.7, 0.01, 10.0, 'on a straight way, m/s')
         self._noise = number(
             self, 'noise', 0.3, 0.0, 10.0, 'deviation of the commands, as a share of the speed'
         )
         self._clearance_m = number(self, 'clearance_m', 0.3, 0.0, 10.0, 'to obstacles, m')
+        places = self.declare_parameter(
+            'places',
+            [0.0],
+            ParameterDescriptor(
+                description='x, y, x, y, ... (m) to drive between; [0.0]: anywhere on the map',
+                read_only=True,
+            ),
+        ).value
+        self._places = np.array(places if len(places) > 1 else []).reshape(-1, 2)
         seed = number(self, 'seed', 0.0, 0.0, 1e9, 'of goals and noise')
         self._rng = np.random.default_rng(int(seed))
         self._map: OccupancyGrid | None = None
@@ -89,10 +105,22 @@ class DiffbotDriver(Node):
         assert self._map is not None
         info = self._map.info
         origin = np.array([info.origin.position.x, info.origin.position.y])
-        to_cell = np.floor((here - origin) / info.resolution).astype(int)[::-1]
-        start = self._free[np.abs(self._free - to_cell).sum(axis=1).argmin()]
-        goal = self._free[self._rng.integers(len(self._free))]
+        start = self._cell(here, origin)
+        goal = self._goal(here, origin)
         path = shortest_path(self._occupied, tuple(start.tolist()), tuple(goal.tolist()))
         self._path = (
             origin + (np.array(path, float).reshape(-1, 2)[:, ::-1] + 0.5) * info.resolution
         )
+
+    def _goal(self, here: NDArray[np.float64], origin: NDArray[np.float64]) -> NDArray[np.int64]:
+        """A free cell to drive to: that of another place, or any."""
+        others = self._places[np.linalg.norm(self._places - here, axis=1) > 2 * NEAR_M]
+        if len(others):
+            return self._cell(others[self._rng.integers(len(others))], origin)
+        return np.asarray(self._free[self._rng.integers(len(self._free))])
+
+    def _cell(self, place: NDArray[np.float64], origin: NDArray[np.float64]) -> NDArray[np.int64]:
+        """The free cell nearest to a place, row and column."""
+        assert self._map is not None
+        cell = np.floor((place - origin) / self._map.info.resolution).astype(int)[::-1]
+        return np.asarray(self._free[np.abs(self._free - cell).sum(axis=1).argmin()])

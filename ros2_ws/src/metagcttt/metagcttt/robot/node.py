@@ -17,6 +17,7 @@ from rclpy.duration import Duration
 from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool
 
+from metagcttt.clocks import JumpFreeClock
 from metagcttt.conventions import ConventionalNode
 from metagcttt.converters import state_message, to_array
 from metagcttt.diagnostics import Diagnostics
@@ -38,9 +39,10 @@ class RobotBridgeNode(ConventionalNode):
     """Publishes a robot's state at the rate of its contract, and the policy's actions as commands.
 
     A robot is never reset, so there is one episode. Observations go by the node's clock, with
-    which the contract's `stamp: header` compares the robot's; deadlines of commands go by a steady
-    one, as simulated time may stand still. Where simulated time goes back, the simulation was
-    started again: that is another world, in which no goal is in force.
+    which the contract's `stamp: header` compares the robot's, and on simulated time so do rates of
+    commands; deadlines of commands go by a steady one, as simulated time may stand still. Where
+    simulated time goes back, the simulation was started again: that is another world, in which no
+    goal is in force.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -60,6 +62,7 @@ class RobotBridgeNode(ConventionalNode):
         self._fingerprint = self._contract.identity['fingerprint']
         self._observer = Observer(self._contract)
         self._pilot = Pilot(self._contract)
+        self._robot_clock = JumpFreeClock(self)
         self._begin_world()
         self._jumps = self.get_clock().create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=RESTART),
@@ -102,12 +105,13 @@ class RobotBridgeNode(ConventionalNode):
     def destroy_node(self) -> None:
         """Stop following the clock, then destroy the node."""
         self._jumps.unregister()
+        self._robot_clock.close()
         super().destroy_node()
 
     def end_service(self) -> None:
         """Send the last commands; nothing is sent after them."""
         self._ended = True
-        for number, command in self._pilot.farewell(time.monotonic_ns()):
+        for number, command in self._pilot.farewell(self._robot_ns()):
             self._send(number, command)
 
     def _begin_world(self) -> None:
@@ -145,7 +149,7 @@ class RobotBridgeNode(ConventionalNode):
         if refusal:
             self._note('refused_actions', refusal)
         else:
-            self._act(due=False)
+            self._act(due=self._pilot.repeats)
 
     def _on_stop(self, message: Bool) -> None:
         if message.data:
@@ -205,8 +209,16 @@ class RobotBridgeNode(ConventionalNode):
         if self._ended:
             return
         self._pilot.fault = self._observer.late or self._rivals()
-        for number, command in self._pilot.commands(time.monotonic_ns(), due=due):
+        for number, command in self._pilot.commands(
+            time.monotonic_ns(), due=due, robot_ns=self._robot_ns()
+        ):
             self._send(number, command)
+
+    def _robot_ns(self) -> int:
+        """The time by which the robot moves; never goes back."""
+        if self.get_parameter('use_sim_time').value:
+            return round(self._robot_clock.now_s() * 1e9)
+        return time.monotonic_ns()
 
     def _rivals(self) -> str:
         """Who else commands the robot; empty when nobody does."""

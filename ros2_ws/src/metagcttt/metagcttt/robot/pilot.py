@@ -38,11 +38,13 @@ class Situation:
 class Pilot:
     """Turns actions into commands that are within limits, in reach and never too old.
 
-    All times are nanoseconds of one monotonic clock.
+    All times are nanoseconds of one monotonic clock, but for those of the robot's own clock, by
+    which commands are in reach of one another: simulated time may be faster or stand still.
 
     Attributes:
         stopped: Why the robot is stopped, until it is cleared; empty when it is not.
         fault: Why there must be no command now, such as a late topic; set by the owner.
+        repeats: Whether the newest action only repeats the answer to the same observation.
     """
 
     def __init__(self, contract: Contract) -> None:
@@ -54,6 +56,7 @@ class Pilot:
         self._action: _Action | None = None
         self.stopped = ''
         self.fault = ''
+        self.repeats = False
 
     def saw_observation(self, step: int, observation: NDArray[np.float64], now_ns: int) -> None:
         """Remember when an observation was made, which limits the age of its action."""
@@ -78,7 +81,11 @@ class Pilot:
         observed_ns, observation = self._steps[step]
         if self._action is not None and observed_ns < self._action.observed_ns:
             return f'the action for step {step} came after that for a newer one'
+        last = self._action
         self._action = _Action(values, withheld, query_id, observed_ns, observation)
+        self.repeats = last is not None and (
+            (last.observed_ns, last.query_id, last.withheld) == (observed_ns, query_id, withheld)
+        )
         return ''
 
     def forget(self) -> None:
@@ -104,15 +111,19 @@ class Pilot:
             return Situation('silent', 'the policy keeps the robot still')
         return Situation()
 
-    def commands(self, now_ns: int, *, due: bool) -> list[tuple[int, NDArray[np.float64]]]:
+    def commands(
+        self, now_ns: int, *, due: bool, robot_ns: int | None = None
+    ) -> list[tuple[int, NDArray[np.float64]]]:
         """The commands to send now, each with the number of its topic in the contract.
 
         Args:
             now_ns: The time.
+            robot_ns: The time of the robot, if it has another clock.
             due: Only those that are due, because the last one is a period old: the next action is
                 under way, and a repetition before it would be taken for its answer.
         """
         found = []
+        robot_ns = now_ns if robot_ns is None else robot_ns
         for number, (topic, commander) in enumerate(
             zip(self._contract.act, self._commanders, strict=True)
         ):
@@ -120,20 +131,20 @@ class Pilot:
                 continue
             case = self.situation(topic, now_ns).case
             if case:
-                command = commander.fall_back(getattr(topic.fallback, case), now_ns)
+                command = commander.fall_back(getattr(topic.fallback, case), robot_ns)
             else:
                 assert self._action is not None
                 part = split_action(self._contract, self._action.values)[number]
-                command = commander.command(part, self._action.observation, now_ns)
+                command = commander.command(part, self._action.observation, robot_ns)
             if command is not None:
                 self._sent_ns[number] = now_ns
                 found.append((number, command))
         return found
 
-    def farewell(self, now_ns: int) -> list[tuple[int, NDArray[np.float64]]]:
+    def farewell(self, robot_ns: int) -> list[tuple[int, NDArray[np.float64]]]:
         """The last commands, as the contract says for the end of the bridge."""
         last = [
-            commander.fall_back(topic.fallback.shutdown, now_ns)
+            commander.fall_back(topic.fallback.shutdown, robot_ns)
             for topic, commander in zip(self._contract.act, self._commanders, strict=True)
         ]
         return [(number, command) for number, command in enumerate(last) if command is not None]
