@@ -16,6 +16,7 @@ void nearest_per_episode(int64_t parts, const int64_t *starts, const int64_t *st
                       int64_t *rows)
 {
     double distance[BLOCK];
+    int32_t inside[BLOCK];
     for (int64_t part = 0; part < parts; part++) {
         for (int64_t from = starts[part]; from < stops[part]; from += BLOCK) {
             const int64_t left = stops[part] - from, count = left < BLOCK ? left : BLOCK;
@@ -27,10 +28,13 @@ void nearest_per_episode(int64_t parts, const int64_t *starts, const int64_t *st
                 const double dy = two * ((y[i] - point[dims - 1]) * scale[dims - 1]);
                 distance[i] = sqrt(dx * dx + dy * dy);
             }
-            for (int64_t i = 0; i < count; i++) {
-                if (!(distance[i] <= radius))
-                    continue;
-                const int64_t episode = episodes[from + i], row = order[from + i];
+            int64_t hits = 0;
+            for (int64_t i = 0; i < count; i++) { /* without a branch to guess wrong */
+                inside[hits] = (int32_t)i;
+                hits += distance[i] <= radius;
+            }
+            for (int64_t hit = 0; hit < hits; hit++) {
+                const int64_t i = inside[hit], episode = episodes[from + i], row = order[from + i];
                 if (first_usable && row < first_usable[episode])
                     continue;
                 if (distance[i] < distances[episode] ||

@@ -59,5 +59,5 @@ class FilterConfig(Settings):
 
     @property
     def cell_size(self) -> float:
-        """Edge of the spatial index's cells, in scaled units: a query reads 25 or 36 of them."""
-        return self.epsilon / 2
+        """Edge of the spatial index's cells, in scaled units: a ball is 8 of them across."""
+        return self.epsilon / 4

@@ -181,18 +181,28 @@ class SpatialIndex:
         return np.floor((values - self._origin[axis]) / self._edges[axis]).astype(np.int64)
 
     def _parts(self, point: np.ndarray, radius: float) -> list[slice]:
-        """Runs of the sorted rows whose cells overlap the ball's bounding box."""
+        """Runs of the sorted rows, of all cells that overlap the ball."""
         planar = (point * self._scale)[:2]
-        margin = radius * (1 + 1e-9) + 1e-9 * (np.abs(planar) + np.abs(self._origin)).max()
+        slack = 1e-9 * (np.abs(planar) + np.abs(self._origin)).max()
+        margin = radius * (1 + 1e-9) + slack
         low = np.maximum(planar - margin, self._origin)
         high = np.minimum(planar + margin, self._extent)
         if np.any(low > high):
             return []
-        first = [int(self._cell(low[axis], axis)) for axis in range(len(low))]
-        last = [int(self._cell(high[axis], axis)) for axis in range(len(high))]
-        in_range = slice(*np.searchsorted(self._occupied, [first[0], last[0] + 1]))
-        columns = self._occupied[in_range] * self._stride
-        in_column = (first[1], last[1]) if len(first) == 2 else (0, 0)
-        begin = self._starts[np.searchsorted(self._keys, columns + in_column[0], side='left')]
-        end = self._starts[np.searchsorted(self._keys, columns + in_column[1], side='right')]
-        return [slice(a, b) for a, b in zip(begin, end, strict=True) if a < b]
+        first, last = (int(self._cell(edge[0], 0)) for edge in (low, high))
+        columns = self._occupied[slice(*np.searchsorted(self._occupied, [first, last + 1]))]
+        in_column = self._chords(columns, planar, margin, slack) if len(planar) == 2 else (0, 0)
+        begin = self._starts[np.searchsorted(self._keys, columns * self._stride + in_column[0])]
+        end = np.searchsorted(self._keys, columns * self._stride + in_column[1], side='right')
+        return [slice(a, b) for a, b in zip(begin, self._starts[end], strict=True) if a < b]
+
+    def _chords(
+        self, columns: np.ndarray, planar: np.ndarray, radius: float, slack: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The first and the last cell of each column that the ball reaches."""
+        left = self._origin[0] + columns * self._edges[0]
+        away = np.maximum(left - planar[0], planar[0] - left - self._edges[0]) - slack
+        half = np.sqrt(np.maximum(radius**2 - np.maximum(away, 0) ** 2, 0)) + slack
+        low, high = planar[1] - half, planar[1] + half
+        lowest, highest = self._origin[1], self._extent[1]
+        return self._cell(low.clip(lowest, highest), 1), self._cell(high.clip(lowest, highest), 1)

@@ -8,11 +8,12 @@ import numpy as np
 
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.retrieval.config import FilterConfig
+from metagcttt_core.retrieval.peaks import ranges
 from metagcttt_core.retrieval.registry import VARIANTS
 from metagcttt_core.retrieval.spatial_index import Ball, SpatialIndex
 from metagcttt_core.retrieval.support import SupportSet
 from metagcttt_core.retrieval.value_cache import ValueCache, ValueFunction
-from metagcttt_core.retrieval.variants import ranges, Task
+from metagcttt_core.retrieval.variants import Task
 
 __all__ = ['TrajectoryFilter', 'ValueFunction']
 
@@ -84,6 +85,7 @@ class TrajectoryFilter:
             near_state=Ball(self._index, place[dims], epsilon),
             near_goal=Ball(self._index, target[dims], epsilon),
             value=None if value_fn is None else partial(self._value_cache.values, value_fn, goal),
+            value_known=value_fn is not None and self._value_cache.is_complete(value_fn, goal),
         )
         found = VARIANTS[self.config.variant](task, self.config)
         starts = found.starts[found.keep]

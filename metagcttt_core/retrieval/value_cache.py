@@ -24,6 +24,7 @@ class ValueCache:
         self._dataset = dataset
         self._capacity = capacity
         self._values: OrderedDict[tuple[ValueFunction, bytes], np.ndarray] = OrderedDict()
+        self._complete: set[tuple[ValueFunction, bytes]] = set()
         self._lock = threading.Lock()
 
     def values(self, value_fn: ValueFunction, goal: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -65,7 +66,15 @@ class ValueCache:
             if should_stop():
                 return False
             self._evaluate(value_fn, goal, known, unknown[start : start + _BATCH_ROWS])
+        with self._lock:
+            self._complete.add((value_fn, goal.tobytes()))
         return True
+
+    def is_complete(self, value_fn: ValueFunction, goal: np.ndarray) -> bool:
+        """True if every row is known since a `prefetch`."""
+        key = (value_fn, self._in_precision(goal).tobytes())
+        with self._lock:
+            return key in self._values and key in self._complete
 
     def _in_precision(self, goal: np.ndarray) -> np.ndarray:
         """The goal in float32, as observations are, unless these have an origin."""
@@ -78,7 +87,7 @@ class ValueCache:
             if key not in self._values:
                 self._values[key] = np.full(self._dataset.num_rows, np.nan, np.float32)
                 if len(self._values) > self._capacity:
-                    self._values.popitem(last=False)
+                    self._complete.discard(self._values.popitem(last=False)[0])
             self._values.move_to_end(key)
             return self._values[key]
 

@@ -10,16 +10,14 @@ the best. A trajectory and its cut, by row of the dataset:
 The last row has no next state, so a cut that ends there stops before it.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.retrieval.config import FilterConfig
+from metagcttt_core.retrieval.peaks import high_rows, ranges, RowValues
 from metagcttt_core.retrieval.spatial_index import Ball
-
-RowValues = Callable[[np.ndarray], np.ndarray]
 
 # The published GC-TTT code turns V into a step distance with this discount, whatever the agent's.
 _GCTTT_DISCOUNT = 0.99
@@ -34,12 +32,14 @@ class Task(NamedTuple):
         near_state: Rows within epsilon of s.
         near_goal: Rows within epsilon of g.
         value: V(. | g) of rows, or None without a critic.
+        value_known: V of every row is known: rows cost nothing.
     """
 
     dataset: TrajectoryDataset
     near_state: Ball
     near_goal: Ball
     value: RowValues | None
+    value_known: bool = False
 
 
 class Candidates(NamedTuple):
@@ -73,7 +73,7 @@ def paper(task: Task, config: FilterConfig) -> Candidates:
     if task.value is None:
         end = _closest_to_goal(task, start.episodes, start.rows)
     else:
-        end = _highest_value(task, start.episodes, start.rows)
+        end = _highest_value(task, start.episodes, start.rows, config)
     starts = start.rows[np.searchsorted(start.episodes, end.episodes)]
     scores = -end.values
     return Candidates(
@@ -124,8 +124,10 @@ def score_only(task: Task, config: FilterConfig) -> Candidates:
     """Ablation: the best trajectories for the goal, from their beginning, wherever s is."""
     data = task.dataset
     episodes = np.arange(data.num_episodes)
-    find_end = _closest_to_goal if task.value is None else _highest_value
-    end = find_end(task, episodes, data.episode_starts)
+    if task.value is None:
+        end = _closest_to_goal(task, episodes, data.episode_starts)
+    else:
+        end = _highest_value(task, episodes, data.episode_starts, config)
     scores = -end.values
     return Candidates(
         num_relevant=len(episodes),
@@ -182,24 +184,37 @@ def _nearest(task: Task, ball: Ball, first_usable: np.ndarray | None = None) -> 
     return smallest_per_episode(episodes, rows, distances)
 
 
-def _highest_value(task: Task, episodes: np.ndarray, starts: np.ndarray) -> PerEpisode:
-    """Per trajectory the state of highest V from its start on, as the smallest of -V."""
-    rows = ranges(starts, task.dataset.episode_ends[episodes] + 1)
-    return smallest_per_episode(task.dataset.episode_of(rows), rows, -_values(task, rows))
+def _highest_value(
+    task: Task, episodes: np.ndarray, starts: np.ndarray, config: FilterConfig
+) -> PerEpisode:
+    """Per trajectory the state of highest V from its start on, as the smallest of -V.
+
+    It may be too low a state for a trajectory that is not among the best.
+    """
+    count = _number_kept(len(episodes), config)
+    rows, values = _high_rows(task, starts, task.dataset.episode_ends[episodes] + 1, count)
+    return smallest_per_episode(task.dataset.episode_of(rows), rows, -values)
 
 
-def _values(task: Task, rows: np.ndarray) -> np.ndarray:
+def _high_rows(
+    task: Task, starts: np.ndarray, stops: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
     assert task.value is not None, 'only the critic-based rules ask for values'
-    return task.value(rows)
+    if task.value_known:
+        rows = ranges(starts, stops)
+        return rows, task.value(rows)
+    return high_rows(task.value, starts, stops, count)
 
 
 def _best(scores: np.ndarray, config: FilterConfig) -> np.ndarray:
     """Positions of the best scores, ascending: the top k, or p percent; ties to the earlier."""
+    return np.sort(np.argsort(-scores, kind='stable')[: _number_kept(len(scores), config)])
+
+
+def _number_kept(scored: int, config: FilterConfig) -> int:
     if config.top_k is not None:
-        count = config.top_k
-    else:
-        count = max(1, int(np.ceil(config.top_percent * len(scores) / 100)))
-    return np.sort(np.argsort(-scores, kind='stable')[:count])
+        return config.top_k
+    return max(1, int(np.ceil(config.top_percent * scored / 100)))
 
 
 def _gcttt_by_steps(task: Task, config: FilterConfig) -> Candidates:
@@ -243,21 +258,16 @@ def _gcttt_by_value(task: Task, config: FilterConfig) -> Candidates:
     relevant, firsts = near_episodes[first_slots], near_s[first_slots]
     eligible = firsts + config.min_steps <= data.episode_ends[relevant]
     episodes, firsts = relevant[eligible], firsts[eligible]
-    rows = ranges(firsts + config.min_steps, data.episode_ends[episodes] + 1)
-    inside = 1 + (1 - _GCTTT_DISCOUNT) * _values(task, rows).astype(np.float64)
+    kept = config.model_copy(update={'top_k': config.top_k or _GCTTT_NUM_SELECTED})
+    rows, values = _high_rows(
+        task,
+        firsts + config.min_steps,
+        data.episode_ends[episodes] + 1,
+        _number_kept(len(episodes), kept),
+    )
+    inside = 1 + (1 - _GCTTT_DISCOUNT) * values.astype(np.float64)
     steps = np.log(np.where(inside > 0, inside, 1)) / np.log(_GCTTT_DISCOUNT)
     distances = np.where(inside > 0, steps, np.finfo(np.float64).max)  # V below -100: far away
     best = smallest_per_episode(data.episode_of(rows), rows, distances)
-    keep = _best(
-        -best.values, config.model_copy(update={'top_k': config.top_k or _GCTTT_NUM_SELECTED})
-    )
+    keep = _best(-best.values, kept)
     return Candidates(len(relevant), episodes, firsts, best.rows, -best.values, keep)
-
-
-def ranges(starts: np.ndarray, stops: np.ndarray) -> np.ndarray:
-    """The rows of all [start, stop), in order."""
-    counts = stops - starts
-    if not len(counts):
-        return np.empty(0, np.int64)
-    offsets = np.repeat(starts - np.concatenate([[0], np.cumsum(counts)[:-1]]), counts)
-    return offsets + np.arange(counts.sum())

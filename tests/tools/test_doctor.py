@@ -3,6 +3,7 @@ import importlib.util
 import shutil
 import sys
 
+from metagcttt_core import kernels
 from metagcttt_tools import doctor
 from metagcttt_tools.doctor import Finding
 import pytest
@@ -12,7 +13,16 @@ def test_all_is_well_where_the_tests_run(capsys, monkeypatch) -> None:
     monkeypatch.setattr(doctor, '_seconds_to_hear', lambda domain: 0.1)
     doctor.main([])
     printed = capsys.readouterr().out
-    for check in ('Python', 'PyTorch', 'extra mazes', 'compiler', 'rendering', 'ROS 2', 'DDS'):
+    for check in (
+        'Python',
+        'PyTorch',
+        'extra mazes',
+        'compiler',
+        'engine',
+        'rendering',
+        'ROS 2',
+        'DDS',
+    ):
         assert check in printed
 
 
@@ -49,6 +59,25 @@ def test_compiler_is_the_one_that_cxx_names(monkeypatch) -> None:
     monkeypatch.setenv('CXX', 'nosuch++')
     assert doctor.compiler().found == 'without nosuch++'
     assert 'apt install g++' in doctor.compiler().mend
+
+
+@pytest.fixture
+def nothing_compiled(tmp_path, monkeypatch):
+    """A machine whose kernels nothing has looked for yet."""
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
+    kernels._find.cache_clear()
+    yield
+    kernels._find.cache_clear()
+
+
+def test_engine_is_told_with_the_reason_of_a_slower_one(nothing_compiled, monkeypatch) -> None:
+    monkeypatch.setenv('CC', 'no-such-compiler')
+    finding = doctor.engine()
+    assert finding.found.startswith('analytic; engine kernels: no-such-compiler: ')
+    assert 'apt install gcc' in finding.mend
+    monkeypatch.delenv('CC')
+    kernels._find.cache_clear()
+    assert doctor.engine() == ('engine', 'kernels, compiled', '')
 
 
 @pytest.mark.mujoco

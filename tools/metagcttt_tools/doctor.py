@@ -21,7 +21,7 @@ from metagcttt_tools.common.extras import EXTRAS, install_command
 _DESCRIPTION = """Say what works on this machine, and how to mend what does not.
 
 Example: metagcttt doctor
-Changes nothing. Ends with status 1 if something is missing."""
+Changes nothing but the cache of compiled kernels. Ends with status 1 if something is missing."""
 
 _DISCOVERY_S = 5.0
 _LAST_DOMAIN = 232  # its ports are the last below 65536
@@ -77,6 +77,23 @@ def compiler() -> Finding:
     mend = 'install g++ and cmake (Debian, Ubuntu: apt install g++ cmake)' if missing else ''
     found = f'without {", ".join(missing)}' if missing else ', '.join(tools)
     return Finding('compiler', found, mend)
+
+
+def engine() -> Finding:
+    """What will compute gradient steps on the processor, and whether the kernels compile."""
+    from metagcttt_core import make_agent
+    from metagcttt_core.training.engine import make_engine
+    from metagcttt_core.training.optimizers import make_optimizer
+
+    agent = make_agent('gcbc', obs_dim=2, act_dim=2, hidden=(8,))
+    parameters = list(agent.trained_parameters())
+    arguments = agent, make_optimizer('adam', parameters, 1e-3), parameters
+    try:
+        return Finding('engine', f'{make_engine("kernels", *arguments).name}, compiled')
+    except ValueError as error:
+        name = make_engine('auto', *arguments).name
+        mend = 'steps are slower: install a C compiler (Debian, Ubuntu: apt install gcc)'
+        return Finding('engine', f'{name}; {error}', mend)
 
 
 def rendering() -> Finding:
@@ -137,7 +154,7 @@ def examine() -> Iterator[Finding]:
     yield torch()
     yield from packages()
     single: tuple[Callable[[], Finding], ...]
-    single = (compiler, rendering, ros, discovery, shared_memory)
+    single = (compiler, engine, rendering, ros, discovery, shared_memory)
     for check in single:
         yield check()
 

@@ -84,3 +84,17 @@ def test_bad_values_are_refused_and_not_remembered(value_fn, message, dataset):
     for _ in range(2):
         with pytest.raises(ValueError, match=message):
             cache.values(value_fn, GOAL, np.arange(3))
+
+
+def test_a_goal_is_complete_from_its_prefetch_until_it_makes_room(dataset):
+    value, cache = CountingValue(), ValueCache(dataset, capacity=1)
+    cache.values(value, GOAL, np.arange(4))
+    assert not cache.is_complete(value, GOAL)
+    assert not cache.prefetch(value, GOAL, lambda: True)
+    assert not cache.is_complete(value, GOAL)
+    cache.prefetch(value, GOAL)
+    assert cache.is_complete(value, GOAL)
+    assert not cache.is_complete(value, GOAL + 1)
+    cache.values(value, GOAL + 1, np.arange(4))
+    cache.values(value, GOAL, np.arange(4))
+    assert not cache.is_complete(value, GOAL)
