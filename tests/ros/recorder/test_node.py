@@ -1,5 +1,7 @@
 from collections.abc import Callable
 from pathlib import Path
+import resource
+import signal
 from time import time_ns
 
 from geometry_msgs.msg import PoseStamped
@@ -22,6 +24,7 @@ from metagcttt_tools.recordings.trajectories import STATE
 import numpy as np
 import pytest
 from rcl_interfaces.msg import Log
+from rclpy.serialization import serialize_message
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import (
     Qos,
@@ -307,3 +310,46 @@ def test_definition_holds_every_type_in_a_message() -> None:
 def test_unknown_type_is_refused_by_name(name: str) -> None:
     with pytest.raises(UnknownTypeError, match=name):
         message_class(name)
+
+
+@pytest.mark.parametrize('name', ['run.mcap', 'run'])
+def test_full_disk_loses_what_comes_meanwhile_and_nothing_before_or_after(
+    tmp_path: Path, name: str
+) -> None:
+    rng = np.random.default_rng(0)
+
+    def add(stamps: range) -> None:
+        for stamp in stamps:
+            data = serialize_message(String(data=f'{stamp} {rng.bytes(2000).hex()}'))
+            recording.add('/text', data, log_time=stamp, publish_time=stamp)
+
+    recording = Recording(tmp_path / name)
+    recording.add_topic('/text', 'std_msgs/msg/String')
+    add(range(1, 11))
+    recording.flush()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (recording.paths[0].stat().st_size, limits[1]))
+        add(range(11, 14))
+        with pytest.raises(OSError, match='File too large'):
+            recording.flush()
+        resource.setrlimit(resource.RLIMIT_FSIZE, (0, limits[1]))
+        add(range(14, 16))
+        for _ in range(2):
+            with pytest.raises(OSError, match='File too large'):
+                recording.flush()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, ignored)
+    recording.flush()
+    add(range(16, 21))
+    recording.close()
+    assert recording.num_lost == 2
+    first, second = recording.paths
+    found = [
+        [int(recorded.message.data.split()[0]) for recorded in read.messages]
+        for read in (read_messages(path, ('std_msgs/msg/String',)) for path in (first, second))
+    ]
+    assert found == [list(range(1, 11)), list(range(16, 21))]
+    assert [path.name for path in sorted(first.parent.glob('*.mcap'))] == [first.name, second.name]

@@ -1,5 +1,7 @@
 """The recorder node."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import datetime, UTC
 from functools import partial
 from pathlib import Path
@@ -21,6 +23,7 @@ from metagcttt.recorder.recording import message_class, Recording, UnknownTypeEr
 
 SEARCH_PERIOD_S = 0.1
 QUIET_S = 0.5
+TOLD_S = 5.0
 DRAIN_S = 0.1
 GRACE_S = 2.0
 OF_ALL_ROBOTS = ('/clock', '/diagnostics')
@@ -58,7 +61,7 @@ class RecorderNode(ConventionalNode):
         # Not the node's clock, which stops when the simulation is paused.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(SEARCH_PERIOD_S, self._search, clock=steady)
-        self.create_timer(self._settings['flush_s'], self._recording.flush, clock=steady)
+        self.create_timer(self._settings['flush_s'], self._flush, clock=steady)
         self.get_logger().info(f'recording to {output}')
         self._search()
 
@@ -68,7 +71,7 @@ class RecorderNode(ConventionalNode):
         Where all end together, those that publish here end first, so that their last words are
         recorded; a graph that goes on is left after `GRACE_S`, a quiet one after `QUIET_S`.
         """
-        self._recording.flush()
+        self._flush()
         executor = SingleThreadedExecutor(context=self.context)
         executor.add_node(self)
         begin = heard = time.monotonic()
@@ -82,7 +85,8 @@ class RecorderNode(ConventionalNode):
                 heard = time.monotonic()
         executor.shutdown()
         super().destroy_node()
-        self._recording.close()
+        with self._telling():
+            self._recording.close()
         names = ', '.join(str(path) for path in self._recording.paths)
         self.get_logger().info(f'{self._recording.num_messages} messages in {names}')
 
@@ -145,12 +149,29 @@ class RecorderNode(ConventionalNode):
         published = info['source_timestamp'] or received
         # Simulated time may run so fast that this node's own delay would matter.
         is_simulated = self.get_parameter('use_sim_time').value
-        self._recording.add(
-            topic,
-            data,
-            log_time=published if is_simulated else received,
-            publish_time=published,
-        )
+        with self._telling():
+            self._recording.add(
+                topic,
+                data,
+                log_time=published if is_simulated else received,
+                publish_time=published,
+            )
+
+    def _flush(self) -> None:
+        with self._telling():
+            self._recording.flush()
+
+    @contextmanager
+    def _telling(self) -> Iterator[None]:
+        """Says what cannot be written, and what is lost meanwhile; it is tried again."""
+        try:
+            yield
+        except OSError as error:
+            self.get_logger().error(
+                f'nothing can be recorded: {error}; {self._recording.paths[-1]} is whole up to '
+                f'here, {self._recording.num_lost} messages are lost since',
+                throttle_duration_sec=TOLD_S,
+            )
 
 
 def _quality(profile: QoSProfile) -> tuple[ReliabilityPolicy, DurabilityPolicy]:

@@ -1,12 +1,13 @@
 """MCAP files and bag folders of serialized ROS messages, for standard tools."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from itertools import count
 import os
 from pathlib import Path
 import re
-from typing import Any
+from typing import Any, cast, IO
 
 from ament_index_python.packages import get_package_share_directory
 from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
@@ -106,12 +107,41 @@ def _types_in(type_name: str, text: str) -> Iterator[str]:
             yield f'{owner or package}/msg/{name}'
 
 
+class _WholeRecords:
+    """A file in which a write is whole or not at all, so that it stays readable on a full disk."""
+
+    def __init__(self, path: Path) -> None:
+        """Create the file, which must not exist."""
+        self._file = path.open('xb', buffering=0)
+        self.tell = self._file.tell
+        self.close = self._file.close
+
+    def write(self, data: bytes) -> None:
+        """Append records."""
+        begin, left = self._file.tell(), memoryview(data)
+        try:
+            while left:
+                left = left[self._file.write(left) :]
+        except OSError:
+            self._file.seek(begin)
+            self._file.truncate()
+            raise
+
+    def flush(self) -> None:
+        """Nothing is kept back."""
+
+
 class Recording:
     """A recording: one MCAP file or, with a size limit, consecutive files, or a bag folder.
 
     A folder is what `ros2 bag record` makes: NAME/NAME_0.mcap and so on, and metadata.yaml. If the
     process is killed, a recording is readable up to the last `flush`. Nothing that exists is
-    overwritten.
+    overwritten. Where a file cannot be written, as on a full disk, it is readable up to there, and
+    the next file begins as soon as it can.
+
+    Attributes:
+        paths: The files so far.
+        num_lost: Messages that came while nothing could be written.
     """
 
     def __init__(self, path: Path, *, split_bytes: int = 0) -> None:
@@ -135,6 +165,8 @@ class Recording:
         self._spans: dict[str, Span] = {}
         self._all = Span()
         self.paths: list[Path] = []
+        self.num_lost = 0
+        self._is_broken = False
         path.parent.mkdir(parents=True, exist_ok=True)
         if self._folder is not None:
             self._folder.mkdir()
@@ -164,7 +196,8 @@ class Recording:
             UnknownTypeError: If the definition of its type is not installed.
         """
         entry = Topic(type_name, offered, type_hash)
-        self._register(topic, entry)
+        if not self._is_broken:
+            self._register(topic, entry)
         self._topics.setdefault(topic, entry)
 
     def add(self, topic: str, data: bytes, *, log_time: int, publish_time: int) -> None:
@@ -176,7 +209,18 @@ class Recording:
             log_time: Time of reception by the system clock, nanoseconds since 1970.
             publish_time: Time of publication by the system clock, nanoseconds since 1970. Neither
                 is the stamp of a header, which may be simulated time.
+
+        Raises:
+            OSError: If it cannot be written. From then on, messages are lost until a `flush` is
+                able to begin the next file.
         """
+        if self._is_broken:
+            self.num_lost += 1
+            return
+        with self._watched():
+            self._append(topic, data, log_time, publish_time)
+
+    def _append(self, topic: str, data: bytes, log_time: int, publish_time: int) -> None:
         if self._split_bytes and self._file.tell() >= self._split_bytes:
             self._close_file()
             self._open(self._next())
@@ -192,14 +236,38 @@ class Recording:
             span.add(log_time)
 
     def flush(self) -> None:
-        """Pass everything so far to the operating system, where it survives a kill."""
-        self._writer.flush()
-        self._write_metadata()
+        """Pass everything so far to the operating system, where it survives a kill.
+
+        Raises:
+            OSError: If it cannot be written.
+        """
+        with self._watched():
+            if self._is_broken:
+                self._open(self._next())
+                self._is_broken = False
+            self._writer.flush()
+            self._write_metadata()
 
     def close(self) -> None:
-        """Write the index and close the file."""
-        self._close_file()
-        self._write_metadata()
+        """Write the index and close the file.
+
+        Raises:
+            OSError: If it cannot be written.
+        """
+        with self._watched():
+            if not self._is_broken:
+                self._close_file()
+            self._write_metadata()
+
+    @contextmanager
+    def _watched(self) -> Iterator[None]:
+        """Leaves the file as it is, for good, when something cannot be written."""
+        try:
+            yield
+        except OSError:
+            self._file.close()
+            self._is_broken = True
+            raise
 
     def _next(self) -> Path:
         """The file after the last one: of the next number that is free."""
@@ -219,16 +287,22 @@ class Recording:
             new.replace(self._folder / NAME)
 
     def _open(self, path: Path) -> None:
-        self._file = path.open('xb')
+        self._file = _WholeRecords(path)
+        self._writer = Writer(cast('IO[bytes]', self._file))
         self.paths.append(path)
         self._spans[path.name] = Span()
-        self._writer = Writer(self._file)
-        self._writer.start(profile=Profile.ROS2, library='metagcttt')
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
-        for topic, entry in self._topics.items():
-            self._register(topic, entry)
-        self._write_metadata()
+        try:
+            self._writer.start(profile=Profile.ROS2, library='metagcttt')
+            for topic, entry in self._topics.items():
+                self._register(topic, entry)
+            self._write_metadata()
+        except OSError:  # it holds no message yet
+            self.paths.remove(path)
+            del self._spans[path.name]
+            path.unlink()
+            raise
 
     def _register(self, topic: str, entry: Topic) -> None:
         if entry.type_name not in self._schemas:
