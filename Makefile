@@ -25,7 +25,7 @@ demo: setup ## drive the real maze over ROS: three policies, five goals, a table
 	@$(RUN) $(METAGCTTT) demo $(ARGS)
 
 test: setup ## run all tests; ARGS='-k filter' passes options to pytest
-	@$(RUN) $(PYTEST) -n $(WORKERS) $(ARGS)
+	@$(RUN) $(PYTEST) -n $(WORKERS) --dist worksteal $(ARGS)
 
 PRESET := --preset pointmaze-medium-navigate-cpu
 assets: setup ## train the demo's policies from scratch and pack assets/; going on where it ended

@@ -20,6 +20,12 @@ settings.register_profile('default', derandomize=True, max_examples=100, **_UNTI
 settings.register_profile('thorough', database=None, max_examples=2000, **_UNTIMED)
 settings.load_profile(os.environ.get('HYPOTHESIS_PROFILE', 'default'))
 
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Slow tests first, so that at the end no worker waits long for another."""
+    items.sort(key=lambda item: item.get_closest_marker('slow') is None)
+
+
 ROOM = 2 << 30
 
 

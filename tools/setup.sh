@@ -102,13 +102,29 @@ install_packages() {
   "${pip[@]}" -qq install -c "$root/constraints.txt" pip setuptools
   say '2 of 4: PyTorch'
   install_torch "$venv/bin/python" --disable-pip-version-check
-  say "3 of 4: packages ($(grep -c == "$root/constraints.txt") are pinned; minutes the first time)"
-  "${pip[@]}" install -c "$root/constraints.txt" --no-build-isolation -e "$root[$extras]"
+  say "3 of 4: packages ($(grep -c == "$root/constraints.txt") are pinned; minutes the first time; all of pip's output is in $venv/packages.log)"
+  # That a package is installed for editing is meant, and needs no warning.
+  PYTHONWARNINGS='ignore:Editable installation' "${pip[@]}" install -c "$root/constraints.txt" \
+    --no-build-isolation -e "$root[$extras]" | tee "$venv/packages.log" | package_progress
   install_ogbench "$venv/bin/python" --disable-pip-version-check
   [ "$ros" = system ] || "$venv/bin/python" "$root/tools/fix_ros_wheels.py" "$venv"
   mkdir -p "$stamps"
   echo "$root $ros" >"$stamps/made-for"
   packages_digest >"$stamps/packages"
+}
+
+# How many packages pip has come to, and that it installs them.
+package_progress() {
+  local line count=0
+  while IFS= read -r line; do
+    case $line in
+      Collecting\ * | Processing\ * | Requirement\ already*)
+        count=$((count + 1))
+        [ $((count % 50)) != 0 ] || say "  $count found"
+        ;;
+      Installing\ collected\ packages:*) say '  installing them' ;;
+    esac
+  done
 }
 
 # What colcon starts and finishes, and how far cmake is.

@@ -132,7 +132,8 @@ PYTHON = r"""
 case "$*" in
   *'-m venv'*) mkdir -p "$3/bin" && cat "$0" >"$3/bin/python" && chmod +x "$3/bin/python" ;;
   *--dry-run*) echo "Would install torch-2.13.0 ${PLAN:-sympy-1.14.0}" ;;
-  *-m\ pip*) echo "$*" >>"$HOME/pip" ;;
+  *-m\ pip*) echo "$*" >>"$HOME/pip"
+    [[ $* != *' -e '* ]] || printf '%s\n' Collecting\ {1..60} 'Installing collected packages: 1' ;;
   *urlopen*) exit "${NO_ANSWER:-0}" ;;
   *'version_info < (3, 13)'*) exit "${BEFORE_3_13:-0}" ;;
   *purelib*) echo "$HOME" ;;
@@ -168,6 +169,8 @@ def test_every_stage_says_that_it_begins_and_how_far_it_is(set_up) -> None:
     stages = [line for line in printed.splitlines() if ' of 4: ' in line]
     assert [line[:14] for line in stages] == [f'setup: {n} of 4:' for n in (1, 2, 3, 4)]
     assert f'{len(pins())} are pinned' in stages[2]
+    assert printed.count('Collecting') == 0
+    assert ['setup:   50 found', 'setup:   installing them'] == printed.splitlines()[3:5]
     progress = ['setup:   Starting >>> a', 'setup:   10%', 'setup:   Finished <<< a']
     assert printed.splitlines()[-3:] == progress
 

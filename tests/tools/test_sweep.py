@@ -259,7 +259,7 @@ def test_an_evaluation_is_done_once_it_is_there_with_the_same_settings(preset):
 
 @pytest.mark.mujoco
 @pytest.mark.slow
-def test_interrupted_study_goes_on_and_evaluates_every_policy(preset, tmp_path):
+def test_interrupted_study_goes_on_and_evaluates_every_policy(preset, tmp_path, monkeypatch):
     values = yaml.safe_load(preset.read_text())
     values['sweep'] |= {'seeds': [0], 'adaptations': {'ttt': {}}, 'curve': [], 'processes': 1}
     del values['sweep']['arms']['one-step']
@@ -276,7 +276,8 @@ def test_interrupted_study_goes_on_and_evaluates_every_policy(preset, tmp_path):
     assert process.wait(60) == 130
     assert not (study / 'evaluation-ttt.json').exists()
 
-    subprocess.run(command, cwd=ROOT, check=True)
+    monkeypatch.chdir(ROOT)
+    sweep.main(['--preset', str(preset)])
     results = json.loads((study / 'evaluation-ttt.json').read_text())['results']
     evaluated = [Path(result['checkpoint']).parent.name for result in results]
     assert evaluated == ['base-0', 'reptile-0']

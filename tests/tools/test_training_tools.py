@@ -17,11 +17,13 @@ import numpy as np
 import pytest
 from tests.core.builders import maze_walks
 from tests.core.robot.messages import contract
+from tests.programs import start
 from tests.tools.tables import squeezed
 import torch
 
 SMALL_AGENT = ['--hidden', '16', '16', '--training.batch-size', '32']
 ROOT = Path(__file__).resolve().parents[2]
+STEPS = 60
 
 
 @pytest.fixture(scope='module')
@@ -123,6 +125,14 @@ def test_merging_coefficient_is_refused_as_a_rate_of_adam(tmp_path, capsys):
     assert 'learning rate of the outer Adam of fomaml and must be at most 0.01' in printed
 
 
+@pytest.fixture(scope='module')
+def straight(dataset_path, base, tmp_path_factory):
+    """What becomes of a run that nobody interrupts."""
+    out = tmp_path_factory.mktemp('straight')
+    meta_train.main(meta_arguments(dataset_path, base, out, STEPS))
+    return out / 'checkpoint'
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ('number', 'status'),
@@ -133,27 +143,22 @@ def test_merging_coefficient_is_refused_as_a_rate_of_adam(tmp_path, capsys):
         (signal.SIGUSR1, 75),
     ],
 )
-def test_interrupted_run_resumes_to_the_same_bits(number, status, dataset_path, base, tmp_path):
-    steps = 60
-    straight, broken = tmp_path / 'straight', tmp_path / 'broken'
-    meta_train.main(meta_arguments(dataset_path, base, straight, steps))
-    arguments = [*meta_arguments(dataset_path, base, broken, steps), '--checkpoint-every', '3']
-    process = subprocess.Popen(
-        [sys.executable, '-m', 'metagcttt_tools', 'meta-train', *arguments],
-        cwd=ROOT,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    )
-    wait_for(lambda: (broken / 'checkpoint' / 'checkpoint.json').exists(), process)
+def test_interrupted_run_resumes_to_the_same_bits(
+    number, status, straight, dataset_path, base, tmp_path
+):
+    broken = tmp_path / 'broken'
+    arguments = [*meta_arguments(dataset_path, base, broken, STEPS), '--checkpoint-every', '3']
+    process = start(['meta-train', *arguments], ROOT, os.environ, tmp_path / 'log')
+    wait_for((broken / 'checkpoint' / 'checkpoint.json').exists, lambda: process.exitcode)
     os.kill(process.pid, number)
-    assert process.wait(30) == status
+    process.join(60)
+    assert process.exitcode == status, (tmp_path / 'log').read_text()
     interrupted = json.loads((broken / 'checkpoint' / 'checkpoint.json').read_text())
-    assert 0 < interrupted['training']['step'] < steps
+    assert 0 < interrupted['training']['step'] < STEPS
     meta_train.main([*arguments, '--resume'])
-    assert_same_bits(weights(straight / 'checkpoint'), weights(broken / 'checkpoint'))
+    assert_same_bits(weights(straight), weights(broken / 'checkpoint'))
     logged = [json.loads(line)['step'] for line in (broken / 'metrics.jsonl').open()]
-    assert logged == list(range(1, steps + 1))
+    assert logged == list(range(1, STEPS + 1))
 
 
 @pytest.mark.parametrize('program', [pretrain, meta_train])
@@ -172,21 +177,24 @@ def test_a_run_at_its_time_limit_wants_another_turn(program, dataset_path, base,
     assert_same_bits(weights(turns / 'checkpoint'), weights(tmp_path / 'straight' / 'checkpoint'))
 
 
-def wait_for(condition, process, timeout_s=60):
+def wait_for(condition, status, timeout_s=60):
     deadline = time.monotonic() + timeout_s
     while not condition():
-        assert process.poll() is None, f'ended with status {process.returncode}'
+        assert status() is None, f'ended with status {status()}'
         assert time.monotonic() < deadline, f'nothing happened within {timeout_s} s'
         time.sleep(0.01)
 
 
 @pytest.mark.mujoco
 @pytest.mark.slow
-def test_evaluate_writes_success_by_budget_and_seed(dataset_path, base, tmp_path, capsys):
+def test_evaluate_writes_success_by_budget_and_seed_for_any_number_of_processes(
+    dataset_path, base, tmp_path, capsys, monkeypatch
+):
     out = tmp_path / 'evaluation.json'
-    arguments = ['--checkpoints', str(base), '--dataset', str(dataset_path), '--out', str(out)]
-    evaluate.main([*arguments, '--budgets', '0', '1', '--episodes', '1', '--seeds', '0', '1'])
-    (result,) = json.loads(out.read_text())['results']
+    arguments = ['--checkpoints', str(base), '--dataset', str(dataset_path), '--episodes', '1']
+    arguments += ['--budgets', '0', '1', '--seeds', '0', '1', '--ttt.batch-size', '16']
+    evaluate.main([*arguments, '--processes', '2', '--out', str(out)])
+    (result,) = results = json.loads(out.read_text())['results']
     assert [point['budget'] for point in result['curve']] == [0, 1]
     for point in result['curve']:
         assert len(point['per_seed']) == 2
@@ -194,8 +202,11 @@ def test_evaluate_writes_success_by_budget_and_seed(dataset_path, base, tmp_path
         assert point['success'] == pytest.approx(np.mean(point['per_seed']))
     assert '| K = 0 | K = 1 | AUC |' in squeezed(capsys.readouterr().out)
 
+    monkeypatch.setattr(evaluate, 'ProcessPoolExecutor', InThisProcess)
+    evaluate.main([*arguments, '--processes', '1', '--out', str(tmp_path / 'here.json')])
+    assert json.loads((tmp_path / 'here.json').read_text())['results'] == results
 
-@pytest.mark.mujoco
+
 @pytest.mark.mujoco
 @pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith('linux'), reason='looks for children in /proc')
@@ -208,7 +219,7 @@ def test_workers_of_a_killed_evaluation_end(dataset_path, base, tmp_path):
         stderr=subprocess.DEVNULL,
     )
     children = Path(f'/proc/{process.pid}/task/{process.pid}/children')
-    wait_for(lambda: len(children.read_text().split()) >= 3, process)  # two, and a tracker
+    wait_for(lambda: len(children.read_text().split()) >= 3, process.poll)  # two, and a tracker
     workers = [Path(f'/proc/{number}') for number in children.read_text().split()]
     process.kill()
     process.wait()
@@ -286,19 +297,6 @@ def test_packed_data_keep_their_contract(dataset_path, base, tmp_path):
     packed = TrajectoryDataset.load(tmp_path / 'dataset.npz')
     assert packed.contract == identity
     assert packed.num_episodes == 1
-
-
-@pytest.mark.mujoco
-@pytest.mark.slow
-def test_evaluation_does_not_depend_on_the_number_of_processes(dataset_path, base, tmp_path):
-    arguments = ['--checkpoints', str(base), '--dataset', str(dataset_path), '--episodes', '1']
-    arguments += ['--budgets', '1', '--seeds', '3', '--ttt.batch-size', '16']
-    results = []
-    for processes in (1, 2):
-        out = tmp_path / f'{processes}.json'
-        evaluate.main([*arguments, '--processes', str(processes), '--out', str(out)])
-        results.append(json.loads(out.read_text())['results'])
-    assert results[0] == results[1]
 
 
 def test_evaluate_table_shows_mean_error_and_auc():
