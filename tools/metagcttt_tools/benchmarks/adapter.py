@@ -42,14 +42,14 @@ def main(argv: list[str] | None = None) -> None:
 class AdapterBenchmark(Benchmark):
     """From a robot's request to its expert: one robot, many, and more than the adapter can serve.
 
-    Robots and adapter are processes of their own. Every expert is compared with that of adapting
-    here, bit by bit.
+    Robots and adapter are processes of their own; robots repeat an unanswered request once a second,
+    as policy nodes do. Every expert is compared with that of adapting here, bit by bit.
     """
 
     out: Path = Field(Path('out/benchmark/adapter'), description='folder for results and log')
     robots: int = Field(20, ge=1, description='robots that ask')
-    duration_s: float = Field(30.0, gt=0, description='of each of the three stretches, seconds')
-    goal_every_s: float = Field(4.0, gt=0, description='from one goal of a robot to the next')
+    duration_s: float = Field(60.0, gt=0, description='of each of the three stretches, seconds')
+    goal_every_s: float = Field(10.0, gt=0, description='from one goal of a robot to the next')
     rush_every_s: float = Field(
         0.2, gt=0, description='the same in the third stretch, which the adapter cannot serve'
     )
@@ -210,6 +210,7 @@ class AdapterBenchmark(Benchmark):
             'refused': len(of_kind['refused']),
             'failed': len(of_kind['failed']),
             'lost': len(of_kind['lost']),
+            'repeated': sum(outcome.unanswered for outcome in outcomes),
             'other bits': sum(digests[each.goal] != each.digest for each in experts),
             'median (ms)': percentile([each.milliseconds for each in experts], 50),
             'p99 (ms)': percentile([each.milliseconds for each in experts], 99),
