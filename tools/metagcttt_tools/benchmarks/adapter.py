@@ -42,8 +42,8 @@ def main(argv: list[str] | None = None) -> None:
 class AdapterBenchmark(Benchmark):
     """From a robot's request to its expert: one robot, many, and more than the adapter can serve.
 
-    Robots and adapter are processes of their own; robots repeat an unanswered request once a second,
-    as policy nodes do. Every expert is compared with that of adapting here, bit by bit.
+    Robots and adapter are processes of their own; robots repeat an unanswered request once a
+    second, as policy nodes do. Every expert is compared with that of adapting here, bit by bit.
     """
 
     out: Path = Field(Path('out/benchmark/adapter'), description='folder for results and log')
