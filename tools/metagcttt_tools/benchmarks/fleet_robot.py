@@ -85,8 +85,8 @@ def drive(
         while True:
             order = orders.recv()
             orders.send(robot.drive(order))
-    except EOFError:
-        pass
+    except (EOFError, BrokenPipeError):
+        pass  # nobody is there any more
     finally:
         robot.destroy_node()
         rclpy.try_shutdown()
