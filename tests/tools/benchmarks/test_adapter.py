@@ -14,7 +14,7 @@ def test_row_by_hand() -> None:
     outcomes = [
         Outcome('expert', 0, 10.0, wait_ms=1.0, digest='a'),
         Outcome('expert', 1, 30.0, wait_ms=2.0, digest='a'),
-        Outcome('refused', 0, 4.0, reason='full'),
+        Outcome('refused', 0, 4.0, reason='full', unanswered=2),
         Outcome('lost', 0, 60000.0),
         Outcome('failed', 0, 5.0, reason='out of memory'),
     ]
@@ -28,6 +28,7 @@ def test_row_by_hand() -> None:
         'refused': 1,
         'failed': 1,
         'lost': 1,
+        'repeated': 2,
         'other bits': 1,
         'median (ms)': 20.0,
         'p99 (ms)': pytest.approx(29.8),

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from metagcttt_tools.benchmarks.fleet_robot import Outcome
 
 _NUM_GOALS = 10
+_GOAL_STEPS = 100  # from start to goal
 
 _DESCRIPTION = """One adapter for many robots: how long an expert takes, what is refused and lost.
 
@@ -42,14 +43,14 @@ def main(argv: list[str] | None = None) -> None:
 class AdapterBenchmark(Benchmark):
     """From a robot's request to its expert: one robot, many, and more than the adapter can serve.
 
-    Robots and adapter are processes of their own. Every expert is compared with that of adapting
-    here, bit by bit.
+    Robots and adapter are processes of their own; robots repeat an unanswered request once a
+    second, as policy nodes do. Every expert is compared with that of adapting here, bit by bit.
     """
 
     out: Path = Field(Path('out/benchmark/adapter'), description='folder for results and log')
     robots: int = Field(20, ge=1, description='robots that ask')
-    duration_s: float = Field(30.0, gt=0, description='of each of the three stretches, seconds')
-    goal_every_s: float = Field(4.0, gt=0, description='from one goal of a robot to the next')
+    duration_s: float = Field(80.0, gt=0, description='of each of the three stretches, seconds')
+    goal_every_s: float = Field(20.0, gt=0, description='from one goal of a robot to the next')
     rush_every_s: float = Field(
         0.2, gt=0, description='the same in the third stretch, which the adapter cannot serve'
     )
@@ -121,10 +122,12 @@ class AdapterBenchmark(Benchmark):
         config = TTTConfig(steps=self.steps, batch_size=self.batch_size)
         requests, digests = [], []
         for number in range(_NUM_GOALS):
-            # Two states of one trajectory, so that there are data between them.
+            # Two states of one trajectory, so that there are data to adapt on.
             episode = rng.integers(dataset.num_episodes)
-            rows = dataset.episode_starts[episode], dataset.episode_ends[episode]
-            start, end = (np.asarray(dataset.states(int(row)), np.float64) for row in rows)
+            first, last = dataset.episode_starts[episode], dataset.episode_ends[episode]
+            row = int(rng.integers(first, max(first + 1, last - _GOAL_STEPS)))
+            rows = row, min(row + _GOAL_STEPS, int(last))
+            start, end = (np.asarray(dataset.states(each), np.float64) for each in rows)
             goal = Goal(number, 1, end, (0.0, 0.0), seed=self.seed + number)
             request = request_message(
                 robot='',
@@ -210,6 +213,7 @@ class AdapterBenchmark(Benchmark):
             'refused': len(of_kind['refused']),
             'failed': len(of_kind['failed']),
             'lost': len(of_kind['lost']),
+            'repeated': sum(outcome.unanswered for outcome in outcomes),
             'other bits': sum(digests[each.goal] != each.digest for each in experts),
             'median (ms)': percentile([each.milliseconds for each in experts], 50),
             'p99 (ms)': percentile([each.milliseconds for each in experts], 99),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from hashlib import blake2b
 from itertools import count, cycle
 from multiprocessing.connection import Connection
@@ -17,6 +19,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
+REPEAT_S = 1.0
 _LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
@@ -47,7 +50,8 @@ class Outcome:
         milliseconds: From the request to the refusal or to the expert.
         wait_ms: Of that, in the adapter's queue.
         digest: Of the expert's weights.
-        reason: Of a refusal or a failure.
+        reason: Of a refusal or a failure, or what was lost.
+        unanswered: Calls of the service without an answer within a second.
     """
 
     kind: Literal['expert', 'refused', 'failed', 'lost']
@@ -56,6 +60,7 @@ class Outcome:
     wait_ms: float = 0.0
     digest: str = ''
     reason: str = ''
+    unanswered: int = 0
 
 
 def digest_of(weights: bytes) -> str:
@@ -80,8 +85,8 @@ def drive(
         while True:
             order = orders.recv()
             orders.send(robot.drive(order))
-    except EOFError:
-        pass
+    except (EOFError, BrokenPipeError):
+        pass  # nobody is there any more
     finally:
         robot.destroy_node()
         rclpy.try_shutdown()
@@ -120,26 +125,35 @@ class _Robot(Node):
         request = self._requests[goal]
         request.robot, request.request_id = self.get_fully_qualified_name(), number
         began = time.perf_counter()
-        response = self._adapter.call_async(request)
-        self._wait(began, response.done)
-        if not response.done():
-            return Outcome('lost', goal, 1e3 * (time.perf_counter() - began))
-        answer = response.result()
-        if not answer.success:
-            milliseconds = 1e3 * (time.perf_counter() - began)
-            return Outcome('refused', goal, milliseconds, reason=answer.message)
-        self._wait(began, lambda: self._newest.request_id == number)
-        milliseconds = 1e3 * (time.perf_counter() - began)
-        expert = self._newest
+        end, accepted, unanswered = began + self._timeout_s, False, 0
+        while self._newest.request_id != number and (now := time.perf_counter()) < end:
+            # As a policy node does: DDS may lose a request while it still finds the adapter.
+            response = self._adapter.call_async(request)
+            due = min(end, now + REPEAT_S)
+            self._wait(due, response.done)
+            if not response.done():
+                self._adapter.remove_pending_request(response)
+                unanswered += 1
+                continue
+            answer = response.result()
+            if not answer.success:
+                milliseconds = 1e3 * (time.perf_counter() - began)
+                return Outcome(
+                    'refused', goal, milliseconds, reason=answer.message, unanswered=unanswered
+                )
+            accepted = True
+            self._wait(due, lambda: self._newest.request_id == number)
+        milliseconds, expert = 1e3 * (time.perf_counter() - began), self._newest
+        outcome = partial(Outcome, goal=goal, milliseconds=milliseconds, unanswered=unanswered)
         if expert.request_id != number:
-            return Outcome('lost', goal, milliseconds)
+            return outcome('lost', reason='accepted, no expert' if accepted else 'no answer')
         if expert.status != Expert.DONE:
-            return Outcome('failed', goal, milliseconds, expert.wait_ms, reason=expert.reason)
+            return outcome('failed', reason=expert.reason)
         digest = digest_of(bytes(expert.weights))
-        return Outcome('expert', goal, milliseconds, expert.wait_ms, digest)
+        return outcome('expert', wait_ms=expert.wait_ms, digest=digest)
 
-    def _wait(self, began: float, condition: Any) -> None:
-        while not condition() and (left := began + self._timeout_s - time.perf_counter()) > 0:
+    def _wait(self, end: float, condition: Callable[[], bool]) -> None:
+        while not condition() and (left := end - time.perf_counter()) > 0:
             self._executor.spin_once(timeout_sec=left)
 
     def _on_expert(self, message: Expert) -> None:
