@@ -45,6 +45,24 @@ def test_all_goals_get_an_answer_and_results_are_written(tmp_path, capsys):
     assert '| meta + TTT (K = 10) |' in squeezed(capsys.readouterr().out)
 
 
+def test_robot_with_a_contract_is_sent_to_a_goal_by_each_policy(tmp_path, capsys, monkeypatch):
+    assets = tmp_path / 'assets'
+    shutil.copytree(assets_dir(), assets)
+    tasks = '{max_s: 12.0, tasks: [{start: [-3.0, 3.0, 0.0], goal: [0.25, 1.75]}]}'
+    (assets / 'diffbot' / 'tasks.yaml').write_text(tasks)
+    monkeypatch.setenv('METAGCTTT_ASSETS', str(assets))
+    demo.main(['--robot', 'diffbot', '--out', str(tmp_path)])
+    summary = json.loads((tmp_path / 'summary.json').read_text())
+    assert [len(goals) for goals in summary['arms'].values()] == [1, 1, 1]
+    (base,), *adapted = summary['arms'].values()
+    assert base['transitions'] == 0
+    assert all(goals[0]['transitions'] > 0 for goals in adapted)
+    assert any(goals[0]['success'] for goals in adapted)
+    assert all(goals[0]['steps'] > 10 for goals in summary['arms'].values())
+    assert (tmp_path / 'demo.png').stat().st_size > 10_000
+    assert '| meta + TTT (K = 50) | ' in squeezed(capsys.readouterr().out)
+
+
 def test_a_node_that_dies_ends_the_demo_with_its_log(tmp_path, capsys, monkeypatch):
     drive = MazeClient.drive
 

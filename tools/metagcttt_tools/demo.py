@@ -5,13 +5,13 @@ from __future__ import annotations
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any, Literal, TYPE_CHECKING
 
 from metagcttt_core import TrajectoryDataset
 from metagcttt_core.config import assets_dir, Settings
 from metagcttt_core.files import refuse_foreign, write_json
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 from sim_bridge import make_simulator
 
 from metagcttt_tools.common.cli import fail, parse
@@ -21,13 +21,14 @@ from metagcttt_tools.common.session import provenance
 if TYPE_CHECKING:
     from metagcttt_tools.graph.client import GoalOutcome
 
-_DESCRIPTION = """Drive the point maze over ROS 2: three policies, five goals.
+_DESCRIPTION = """Drive to five goals over ROS 2 with three policies: the point maze, or a robot.
 
 Example: make demo, or metagcttt demo in a set-up checkout
 Starts sim_bridge_node, goal_node and policy_node as separate processes, publishes the five
 evaluation goals on `goal_pose` for each arm, prints a table and writes OUT/summary.json and
-OUT/demo.png. With --view the goals are yours: the post-trained policy drives to where you click
-in a browser, until Ctrl-C."""
+OUT/demo.png. With --robot diffbot it is a robot with two wheels, which speaks standard messages
+alone, and robot_bridge_node. With --view the goals are yours: the post-trained policy drives to
+where you click in a browser, until Ctrl-C."""
 
 _ENVIRONMENT = 'pointmaze-medium-v0'
 _ASSETS = 'pointmaze-medium-navigate'
@@ -36,11 +37,30 @@ _ASSETS = 'pointmaze-medium-navigate'
 class DemoSettings(Settings):
     """Settings of the program."""
 
+    robot: Literal['point', 'diffbot'] = Field(
+        'point', description='the point maze, or the robot with two wheels in its room'
+    )
     out: Path = Field(Path('out/demo'), description='folder for summary, picture and node logs')
-    steps: int = Field(10, ge=1, description='test-time training steps K of the adapting arms')
+    steps: int | None = Field(
+        None,
+        ge=1,
+        description='test-time training steps K of the adapting arms; by default 10, and 50 for '
+        'the diffbot',
+    )
     seed: int = Field(0, ge=0, description='random seed of starts, goals and adaptations')
     timeout_s: float = Field(60.0, gt=0, description='longest wait for one goal, seconds')
     view: bool = Field(False, description='send the goals by hand, in the live view')
+
+    @property
+    def budget(self) -> int:
+        """Test-time training steps K."""
+        return self.steps or {'point': 10, 'diffbot': 50}[self.robot]
+
+    @model_validator(mode='after')
+    def _the_view_is_of_the_maze(self) -> DemoSettings:
+        if self.view and self.robot != 'point':
+            raise ValueError(f'view shows the point maze, not {self.robot}')
+        return self
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -55,6 +75,17 @@ def main(argv: list[str] | None = None) -> None:
             drive_by_hand(settings)
             return
         refuse_foreign(settings.out / 'summary.json', settings.out / 'demo.png')
+        if settings.robot == 'diffbot':
+            from metagcttt_tools import demo_robot
+
+            demo_robot.run(
+                settings.robot,
+                steps=settings.budget,
+                seed=settings.seed,
+                timeout_s=settings.timeout_s,
+                out=settings.out,
+            )
+            return
         outcomes = run_arms(settings)
     except (NodeFailedError, NoAnswerError, FileNotFoundError, FileExistsError) as error:
         fail(str(error))
@@ -70,8 +101,8 @@ def run_arms(settings: DemoSettings) -> dict[str, list[GoalOutcome]]:
 
     arms = {
         'base policy': ('base', 0),
-        f'base + TTT (K = {settings.steps})': ('base', settings.steps),
-        f'meta + TTT (K = {settings.steps})': ('meta', settings.steps),
+        f'base + TTT (K = {settings.budget})': ('base', settings.budget),
+        f'meta + TTT (K = {settings.budget})': ('meta', settings.budget),
     }
     return drive_arms(
         {
@@ -104,7 +135,7 @@ def drive_by_hand(settings: DemoSettings) -> None:
             for name, given in (
                 ('sim_bridge_node', {'seed': settings.seed}),
                 ('goal_node', {'seed': settings.seed}),
-                ('policy_node', {'adapt_steps': settings.steps}),
+                ('policy_node', {'adapt_steps': settings.budget}),
             )
         ]
         show(out=settings.out, check=partial(check, nodes))

@@ -53,6 +53,7 @@ PROGRAMS: dict[str, Program | Group] = {
         'evaluate_offline', 'Action error on held-out data, without a simulator.'
     ),
     'evaluate-ros': Program('evaluate_ros', 'The same, driven through the ROS graph.'),
+    'evaluate-robot': Program('evaluate_robot', 'Success on a simulated robot, by its contract.'),
     'sweep': Program('sweep', 'Run a whole study: training, post-training, evaluation.'),
     'report': Program('report', 'Tables and figures of a study.'),
     'demo': Program('demo', 'Drive the point maze over ROS 2: three policies, five goals.'),

@@ -50,6 +50,7 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ('nets_gcbc_pm', 'nets_gcbc_ant', 'nets_gciql_pm'):
         shutil.copy(DATA / f'{name}.npz', folder)
     (folder / 'cart.yaml').write_text(DRIVE)
+    (folder / 'tasks.yaml').write_text('{max_s: 9, tasks: [{goal: {x: 1}}]}')
     (folder / 'table.csv').write_text('run,x,v\n1,1,0.1\n1,2,0.2\n2,3,0.3\n2,4,0.4\n')
     for name, observed in (('by-run', 'x'), ('by-v', 'v')):
         (folder / f'{name}.yaml').write_text(

@@ -2,15 +2,18 @@
 
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from unittest import mock
 
 from metagcttt import commander
 import metagcttt_core
-from metagcttt_tools import demo
+from metagcttt_core.config import assets_dir
+from metagcttt_tools import demo, demo_robot
 from metagcttt_tools.benchmarks import adapter, restarts, ros, state_source
 from metagcttt_tools.benchmarks.fleet_robot import Outcome
 from metagcttt_tools.graph import drive
 from metagcttt_tools.graph import process as nodes
+from metagcttt_tools.graph.robot import RobotOutcome
 from metagcttt_tools.live import replay
 from metagcttt_tools.live import view as live
 import numpy as np
@@ -31,6 +34,18 @@ def watch_graph(patch: pytest.MonkeyPatch, seen: Seen) -> None:
     patch.setattr(drive, 'drive_arms', note)
     patch.setattr(demo, 'report', lambda *_: None)
     patch.setattr(demo, 'drive_by_hand', lambda settings: seen.append('by hand'))
+    watch_robot(patch, seen)
+
+
+def watch_robot(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    def note(graph, arms, drives, client_type, logs):
+        seen.append((list(graph), arms, drives, client_type, logs))
+        report = SimpleNamespace(filter_ms=1.0, adapt_ms=1.0, transitions=1)
+        outcome = RobotOutcome(True, seconds=1.0, steps=1, missed=0, path=[], report=report)
+        return {arm: [outcome] * len(drives) for arm in arms}
+
+    patch.setattr(drive, 'drive_policies', note)
+    patch.setattr(demo_robot, '_draw', lambda *_: None)
 
 
 NO_PARAMETER = 'policy_node has no such parameter'
@@ -83,8 +98,38 @@ EVALUATE_ROS = Walk(
 DEMO = Walk(
     'demo',
     {},
-    {'out': 'elsewhere', 'steps': 3, 'seed': 1, 'timeout_s': 7.0, 'view': True},
+    {
+        'robot': 'diffbot',
+        'out': 'elsewhere',
+        'steps': 3,
+        'seed': 1,
+        'timeout_s': 7.0,
+        'view': True,
+    },
     watch_graph,
+)
+CONTRACTS = Path(__file__).parents[3] / 'config' / 'robots'
+EVALUATE_ROBOT = Walk(
+    'evaluate-robot',
+    {
+        'contract': str(CONTRACTS / 'diffbot.yaml'),
+        'tasks': str(assets_dir() / 'diffbot' / 'tasks.yaml'),
+        'checkpoints': ['policy-{seed}'],
+    },
+    {
+        'contract': str(CONTRACTS / 'arm4.yaml'),
+        'dataset': 'elsewhere.npz',
+        'tasks': '@tasks.yaml',
+        'lr': 0.1,
+        'batch_size': 7,
+        'speed_factor': 2.0,
+        'timeout_s': 7.0,
+        'checkpoints': ['policy-{seed}', 'other-{seed}'],
+        'budgets': [3],
+        'seeds': [0, 1],
+        'out': 'elsewhere/results.json',
+    },
+    watch_robot,
 )
 
 
@@ -252,7 +297,10 @@ BENCHMARK_ADAPTER = Walk(
     watch_adapter,
 )
 
-WALKS = (EVALUATE_ROS, DEMO, VIEW, BENCHMARK_ROS, BENCHMARK_RESTARTS, BENCHMARK_ADAPTER)
+WALKS = (
+    *(EVALUATE_ROS, EVALUATE_ROBOT, DEMO, VIEW),
+    *(BENCHMARK_ROS, BENCHMARK_RESTARTS, BENCHMARK_ADAPTER),
+)
 
 
 @walks_through(WALKS)

@@ -1,11 +1,11 @@
-"""Simulator, goal node and one policy after another as processes, driven in lockstep."""
+"""The graph of a robot and one policy after another as processes."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, ExitStack
 from functools import partial
 import os
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 from domain_coordinator import domain_id
 from metagcttt.commander import NoAnswerError
@@ -18,9 +18,31 @@ from metagcttt_tools.graph.process import NodeProcess
 Parameters = Mapping[str, bool | int | float | str]
 Drive = Callable[[MazeClient], GoalOutcome]
 ArmT = TypeVar('ArmT')
+OutcomeT = TypeVar('OutcomeT')
 
 START_TIMEOUT_S = 30.0
 _LOCKSTEP = {'stepping': 'lockstep'}
+
+
+class Executable(NamedTuple):
+    """What to start: an executable of a ROS package, with parameters."""
+
+    name: str
+    parameters: Parameters
+    package: str = 'metagcttt'
+
+
+class Client(Protocol):
+    """A program's view of a robot."""
+
+    def wait_until_ready(self, timeout_s: float) -> None:
+        """Wait until the nodes hear each other and this program."""
+
+    def destroy_node(self) -> None:
+        """Leave the graph."""
+
+
+ClientT = TypeVar('ClientT', bound=Client)
 
 
 def drive_arms(
@@ -31,7 +53,7 @@ def drive_arms(
     simulator: Parameters | None = None,
     goal_node: Parameters | None = None,
 ) -> dict[ArmT, list[GoalOutcome]]:
-    """Outcome of every drive by arm, from three processes that talk over DDS.
+    """Outcome of every drive in a maze by arm, from three processes in lockstep.
 
     Args:
         arms: Parameters of policy_node by arm.
@@ -44,25 +66,52 @@ def drive_arms(
         NodeFailedError: If a node ends; with its log.
         NoAnswerError: If a node does not answer in time; with all logs.
     """
-    outcomes: dict[ArmT, list[GoalOutcome]] = {}
+    return drive_policies(
+        [
+            Executable('sim_bridge_node', {**_LOCKSTEP, **(simulator or {})}),
+            Executable('goal_node', {**_LOCKSTEP, **(goal_node or {})}),
+        ],
+        {arm: {'adaptation': 'hold', **_LOCKSTEP, **given} for arm, given in arms.items()},
+        drives,
+        MazeClient,
+        logs,
+    )
+
+
+def drive_policies(
+    graph: Sequence[Executable],
+    arms: Mapping[ArmT, Parameters],
+    drives: Sequence[Callable[[ClientT], OutcomeT]],
+    client_type: Callable[[Callable[[], None]], ClientT],
+    logs: Path,
+) -> dict[ArmT, list[OutcomeT]]:
+    """Outcome of every drive by arm, from processes that talk over DDS.
+
+    Args:
+        graph: Every process but that of the policy.
+        arms: Parameters of policy_node by arm.
+        drives: What to do with each arm.
+        client_type: Makes the client, which calls what it is given while it waits.
+        logs: Folder for what the nodes print.
+
+    Raises:
+        NodeFailedError: If a node ends; with its log.
+        NoAnswerError: If a node does not answer in time; with all logs.
+    """
+    outcomes: dict[ArmT, list[OutcomeT]] = {}
     with ExitStack() as stack:
         stack.enter_context(own_domain())
         nodes = [
-            stack.enter_context(NodeProcess(name, {**_LOCKSTEP, **given}, logs / f'{name}.log'))
-            for name, given in (
-                ('sim_bridge_node', simulator or {}),
-                ('goal_node', goal_node or {}),
-            )
+            stack.enter_context(NodeProcess(name, given, logs / f'{name}.log', package=package))
+            for name, given, package in graph
         ]
         rclpy.init()
         stack.callback(rclpy.try_shutdown)
         bar = stack.enter_context(tqdm(total=len(arms) * len(drives), unit='goal', desc='drive'))
         for number, (arm, given) in enumerate(arms.items()):
-            parameters = {'adaptation': 'hold', **_LOCKSTEP, **given}
-            log = logs / f'policy_node_{number}.log'
-            with NodeProcess('policy_node', parameters, log) as policy:
+            with NodeProcess('policy_node', given, logs / f'policy_node_{number}.log') as policy:
                 running = [*nodes, policy]
-                client = MazeClient(partial(check, running))
+                client = client_type(partial(check, running))
                 try:
                     client.wait_until_ready(START_TIMEOUT_S)
                     outcomes[arm] = []

@@ -5,7 +5,6 @@ import time
 from metagcttt_core import Adaptation, TTTConfig
 from metagcttt_interfaces.msg import GoalQuery, MazeState, PolicyStatus
 from rclpy.lifecycle import LifecycleNode
-from rclpy.serialization import serialize_message
 from rclpy.timer import Timer
 
 from metagcttt.clocks import JumpFreeClock, STEADY
@@ -82,7 +81,7 @@ class PolicySession:
         self._acting = False
         self._timer: Timer | None = None
         self._pursuit: Pursuit | None = None
-        self._goal_message: bytes | None = None
+        self._goal_message: str | None = None
         self._state: State | None = None
         self._received_ns = 0  # arrival of the newest state; 0 once answered
         self._answered = True  # lockstep: whether the newest state got its action
@@ -202,8 +201,8 @@ class PolicySession:
 
     def _on_goal(self, message: GoalQuery) -> None:
         self._safety.saw_goal(time.monotonic(), message.lease_s if message.active else 0.0)
-        # As bytes: the position of a robot that has none is NaN, which is unlike itself.
-        said = serialize_message(message)
+        # As text: the position of a robot that has none is NaN, which is unlike itself.
+        said = repr(message)
         if said == self._goal_message:
             return  # a repetition, which only renews the lease
         self._goal_message = said
