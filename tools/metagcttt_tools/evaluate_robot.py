@@ -10,7 +10,7 @@ from typing import Annotated, Any, TYPE_CHECKING, TypeVar
 from metagcttt_core import success_statistics
 from metagcttt_core.config import Settings
 from metagcttt_core.config.yaml_file import load_yaml
-from metagcttt_core.files import write_json
+from metagcttt_core.files import refuse_foreign, write_json
 from metagcttt_core.robot import load_contract
 import numpy as np
 from pydantic import Field, model_validator
@@ -125,8 +125,9 @@ def main(argv: list[str] | None = None) -> None:
         for seed in settings.seeds
     }
     try:
+        refuse_foreign(settings.out)
         outcomes = drive_robot(settings, arms, settings.out.parent / 'logs')
-    except (NodeFailedError, NoAnswerError, ValueError) as error:
+    except (NodeFailedError, NoAnswerError, ValueError, FileExistsError) as error:
         fail(*str(error).splitlines())
     except KeyboardInterrupt:
         raise SystemExit(130) from None
