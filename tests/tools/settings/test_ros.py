@@ -8,6 +8,7 @@ from unittest import mock
 from metagcttt import commander
 import metagcttt_core
 from metagcttt_core.config import assets_dir
+from metagcttt_interfaces.srv import Adapt
 from metagcttt_tools import demo, demo_robot
 from metagcttt_tools.benchmarks import adapter, restarts, ros, state_source
 from metagcttt_tools.benchmarks.fleet_robot import Outcome
@@ -19,6 +20,7 @@ from metagcttt_tools.live import view as live
 import numpy as np
 import pytest
 import rclpy
+from rclpy.serialization import deserialize_message
 from tests.tools.settings.walk import FILTER, INNER_LOOP, Proof, Seen, Walk, walks_through
 
 pytestmark = pytest.mark.ros
@@ -262,7 +264,10 @@ def watch_adapter(patch: pytest.MonkeyPatch, seen: Seen) -> None:
 
         @staticmethod
         def Process(target, args, daemon):
-            seen.append(args[:3])
+            name, requests, timeout_s, _ = args
+            # Not their bytes, between which serialization leaves some as they are.
+            asked = [str(deserialize_message(each, Adapt.Request)) for each in requests]
+            seen.append((name, asked, timeout_s))
             return mock.Mock()
 
     def process(*given):
