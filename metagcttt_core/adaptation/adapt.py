@@ -109,7 +109,7 @@ def adapt(
         return base('the held-out loss never fell below its start', result)
     if not all(torch.isfinite(weight).all() for weight in result.agent.parameters()):
         return base('the adapted weights are not finite', result)
-    if config.guard != 'off':
+    if test_batch is not None and config.guard != 'off':
         before, after = (
             _held_out(each, test_batch, config.guard, actor_only=config.actor_only)
             for each in (agent, result.agent)

@@ -5,8 +5,8 @@ from array import array
 from builtin_interfaces.msg import Time
 from metagcttt_core import Adaptation, Agent, TrajectoryDataset, TTTConfig
 from metagcttt_core.adaptation.weights import changed_weights, with_weights
+from metagcttt_core.retrieval.peaks import ranges
 from metagcttt_core.retrieval.support import SupportSet
-from metagcttt_core.retrieval.variants import ranges
 from metagcttt_interfaces.msg import AdaptationReport, Expert
 from metagcttt_interfaces.srv import Adapt
 import numpy as np
