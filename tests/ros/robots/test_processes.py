@@ -75,8 +75,10 @@ def test_a_driven_robot_is_recorded_and_becomes_a_dataset(
         # driver is there and has planned, periods pass without commands.
         row = np.flatnonzero(~dataset.terminals[:-1])[-80:]
         yaw = np.unwrap(np.arctan2(dataset.observations[:, 3], dataset.observations[:, 2]))
-        turned = np.corrcoef(dataset.actions[row, 1], yaw[row + 1] - yaw[row])
-        assert turned[0, 1] > 0.8
+        row = row[np.abs(dataset.actions[row, 1]) > 0.2]
+        turned = np.sign(yaw[row + 1] - yaw[row])
+        # Not always: an obstacle in the way turns the robot, too.
+        assert np.mean(turned == np.sign(dataset.actions[row, 1])) > 0.8
 
 
 @pytest.mark.mujoco
