@@ -68,7 +68,7 @@ def adapt(
     split_seed, batch_seed = np.random.SeedSequence(seed).spawn(2)
     rng = np.random.default_rng(batch_seed)
     train, test = support, None
-    if config.early_stopping or config.guard != 'off':
+    if config.early_stopping or config.guard != 'none':
         train, test = support.split(
             config.test_fraction, config.max_test, np.random.default_rng(split_seed)
         )
@@ -109,7 +109,7 @@ def adapt(
         return base('the held-out loss never fell below its start', result)
     if not all(torch.isfinite(weight).all() for weight in result.agent.parameters()):
         return base('the adapted weights are not finite', result)
-    if test_batch is not None and config.guard != 'off':
+    if test_batch is not None and config.guard != 'none':
         before, after = (
             _held_out(each, test_batch, config.guard, actor_only=config.actor_only)
             for each in (agent, result.agent)

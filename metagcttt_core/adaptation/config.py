@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 from metagcttt_core.config.settings import Settings
 from metagcttt_core.training.config import EngineName, OptimizerName, Precision
 
-GuardName = Literal['off', 'loss', 'imitation']
+GuardName = Literal['none', 'loss', 'imitation']
 
 
 class InnerLoopConfig(Settings):
@@ -41,7 +41,7 @@ class TTTLoopConfig(InnerLoopConfig):
     )
     early_stopping: bool = Field(False, description='hold out a test split and keep the best step')
     guard: GuardName = Field(
-        'off',
+        'none',
         description='hold out a test split and act with the base policy unless the loss on it, or '
         'the negative log-likelihood of its actions (imitation), fell',
     )

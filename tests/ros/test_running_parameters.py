@@ -13,6 +13,7 @@ import pytest
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 import torch
+import yaml
 
 from tests.ros.fault_rig import FaultRig, WARN
 from tests.ros.goal_rig import FREE, GoalRig
@@ -35,6 +36,11 @@ def test_no_parameter_is_left_out() -> None:
             if parameter.changes == 'now':
                 given = rf"(set|change)\([^)]*\b{parameter.name}=|\(\s*'{parameter.name}', "
                 assert re.search(given, sources), f'{node}: {parameter.name}'
+
+
+def test_choices_are_words_in_parameter_files() -> None:
+    choices = [choice for table in TABLES.values() for each in table for choice in each.choices]
+    assert [yaml.safe_load(choice) for choice in choices] == choices  # `off` would be false
 
 
 @pytest.fixture

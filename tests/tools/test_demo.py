@@ -96,5 +96,6 @@ def test_a_node_that_cannot_configure_shows_its_reason(tmp_path, capsys, monkeyp
 def test_an_unknown_executable_ends_with_what_there_is(tmp_path):
     with NodeProcess('pilot_node', {}, tmp_path / 'log') as node:
         node._process.wait(10)
-        with pytest.raises(NodeFailedError, match="no executable 'pilot_node'; it has: goal_node"):
+        there = 'adapter_node, goal_node'
+        with pytest.raises(NodeFailedError, match=f"no executable 'pilot_node'; it has: {there}"):
             node.check()

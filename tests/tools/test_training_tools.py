@@ -245,7 +245,7 @@ def test_evaluate_begins_with_the_optimizer_state_of_pretraining(
             for config in (ttt, ttt.model_copy(update={'optimizer_state': 'fresh'}))
         ]
         started.append((adapted[0].fingerprint(), adapted[1].fingerprint()))
-        return {'mean': 0.5}
+        return {'mean': 0.5, 'accepted': 1.0}
 
     monkeypatch.setattr(evaluate, 'ProcessPoolExecutor', InThisProcess)
     monkeypatch.setattr(metagcttt_core, 'evaluate_success', success)

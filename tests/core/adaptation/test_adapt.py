@@ -237,7 +237,7 @@ def test_guard_leaves_the_steps_of_early_stopping_as_they_are(dataset):
             GOAL,
             quick(early_stopping=True, lr=1e-3, guard=guard),
         )
-        for guard in ('off', 'loss')
+        for guard in ('none', 'loss')
     ]
     assert results[0].test_losses == results[1].test_losses
     assert results[0].best_step == results[1].best_step > 0

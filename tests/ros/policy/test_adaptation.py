@@ -193,8 +193,8 @@ def test_early_stopping_keeps_the_base_policy_when_the_held_out_loss_only_gets_w
 
 
 def test_guard_keeps_the_base_policy_and_says_why(make_rig) -> None:
-    rig = make_rig(guard='imitation', test_fraction=0.5, adapt_lr=1.0, adapt_steps=2)
-    rig.set(adaptation='hold')
+    rig = make_rig(test_fraction=0.5, adapt_lr=1.0, adapt_steps=2)
+    rig.set(guard='imitation', adaptation='hold')
     rig.state()
     rig.goal()
     report = rig.report()

@@ -213,7 +213,7 @@ def test_failed_configuration_says_why_and_can_be_repeated(
     assert change(rig, Transition.TRANSITION_CONFIGURE)
 
 
-@pytest.mark.parametrize('fails', ['load_deployment', 'warm_up', 'PolicySession'])
+@pytest.mark.parametrize('fails', ['deployment_of', 'warm_up', 'PolicySession'])
 def test_unforeseen_failure_of_configure_is_named_and_not_final(
     make_rig, monkeypatch, fails, capfd
 ) -> None:

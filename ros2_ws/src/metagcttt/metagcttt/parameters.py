@@ -209,10 +209,10 @@ POLICY_NODE = (
     ),
     Parameter(
         'guard',
-        'off',
+        'none',
         'hold out part of the support set and act with the base policy unless the loss on it, or '
         'the negative log-likelihood of its actions (imitation), fell',
-        choices=('off', 'loss', 'imitation'),
+        choices=('none', 'loss', 'imitation'),
         changes='now',
     ),
     Parameter('actor_only', False, 'adapt the actor and not the critic', changes='now'),
