@@ -110,6 +110,7 @@ def test_controls_change_the_graph(graph: Graph, record: Record, view, tmp_path:
         browser.click_checkbox('Test-time training')
         graph.wait(lambda: parameter('adapt_steps') == 0, 'no adaptation')
         browser.click_checkbox('Test-time training')
+        graph.wait(lambda: parameter('adapt_steps') == 10, 'the K of before')
         browser.type_number('K (gradient steps)', '25')
         graph.wait(lambda: parameter('adapt_steps') == 25, 'the K that was typed')
 
