@@ -1,6 +1,7 @@
 import json
 from pathlib import Path
 
+from metagcttt_tools.benchmarks import audience, ros
 from metagcttt_tools.benchmarks.state_source import Answers
 from metagcttt_tools.main import main
 import numpy as np
@@ -19,20 +20,22 @@ def test_latency_and_missed_deadlines_by_hand() -> None:
 
 
 @pytest.mark.slow
-def test_benchmark_measures_a_policy_process(tmp_path: Path, capsys) -> None:
+def test_benchmark_measures_a_policy_process(tmp_path: Path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(ros, '_AUDIENCE_ARRIVES_S', 1.0)
     out = tmp_path / 'bench'
     main(
         [
             *('benchmark', 'ros'),
             *('--out', str(out), '--duration-s', '2', '--idle-s', '1', '--goal-every-s', '0.5'),
             *('--hidden', '16', '16', '--steps', '1', '5', '--repeats', '2'),
-            *('--stepping', 'lockstep'),
+            *('--stepping', 'lockstep', '--audience', 'reader'),
         ]
     )
     report = json.loads((out / 'ros.json').read_text())
-    idle, adapting = report['results']['latency']
-    assert (idle['policy'], adapting['policy']) == ('idle', 'adapting')
-    assert adapting['states'] > 50
+    idle, adapting, watched = report['results']['latency']
+    names = [row['policy'] for row in (idle, adapting, watched)]
+    assert names == ['idle', 'adapting', 'adapting, reader']
+    assert min(adapting['states'], watched['states']) > 50
     assert 0 < idle['median'] <= idle['p99'] <= idle['maximum']
     costs = report['results']['goal_to_action']
     assert [cost['K'] for cost in costs] == [1, 5]
@@ -44,6 +47,15 @@ def test_benchmark_measures_a_policy_process(tmp_path: Path, capsys) -> None:
     printed = squeezed(capsys.readouterr().out)
     assert '| adapting |' in printed
     assert '| K |' in printed
+
+
+def test_browser_that_is_not_there_is_named(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv('PATH', str(tmp_path))
+    with (
+        pytest.raises(FileNotFoundError, match='chromium'),
+        audience.watching('browser', tmp_path),
+    ):
+        pass
 
 
 def test_wrong_setting_is_refused(capsys) -> None:

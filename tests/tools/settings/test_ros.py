@@ -195,6 +195,7 @@ def watch_latency(patch: pytest.MonkeyPatch, seen: Seen) -> None:
     patch.setattr(state_source, 'StateSource', Source)
     patch.setattr(nodes, 'NodeProcess', process)
     patch.setattr(metagcttt_core, 'save_checkpoint', lambda agent, path: seen.append(agent))
+    patch.setattr(ros, 'watching', lambda *given: seen.append(given) or nullcontext())
     patch.setattr(ros, 'write_report', lambda path, *_: seen.append(path))
     without_graph(patch)
 
@@ -220,6 +221,8 @@ BENCHMARK_ROS = Walk(
         'repeats': 2,
         'timeout_s': 7.0,
         'stepping': 'lockstep',
+        'audience': 'reader',
+        'turns': 2,
         'seed': 1,
     },
     watch_latency,

@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import Field
 from tqdm import tqdm
 
+from metagcttt_tools.benchmarks.audience import Audience, watching
 from metagcttt_tools.common.cli import parse
 from metagcttt_tools.common.results import Benchmark, markdown_table, write_report
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 _ENDLESS_STEPS = 10000
 _WARM_UP_S = 2.0
+_AUDIENCE_ARRIVES_S = 5.0  # a page loads the scene
 
 
 _DESCRIPTION = """The policy node over DDS: latency, deadlines and the time a goal costs.
@@ -60,6 +62,12 @@ class RosBenchmark(Benchmark):
     stepping: Literal['realtime', 'lockstep'] = Field(
         'realtime', description='stepping of the policy node'
     )
+    audience: Audience = Field(
+        'none',
+        description='who looks at the live view meanwhile, in every second stretch: a reader, '
+        'which takes what a page gets, or a browser, a headless Chromium at low priority',
+    )
+    turns: int = Field(1, ge=1, description='stretches under adaptation, each with and without')
     seed: int = Field(0, ge=0, description='of weights, states and goals')
 
     def run(self) -> None:
@@ -125,7 +133,18 @@ class RosBenchmark(Benchmark):
         source.play(_WARM_UP_S)
         idle = self._row('idle', source.play(self.idle_s), source)
         source.configure_policy(adapt_steps=_ENDLESS_STEPS)
-        rest = cycle(goals[1:])
+        rows, rest = [idle], cycle(goals[1:])
+        for _ in range(self.turns):
+            rows.append(self._row('adapting', self._adapting(source, rest), source))
+            if self.audience != 'none':
+                with watching(self.audience, self.out):
+                    source.play(_AUDIENCE_ARRIVES_S)
+                    answers = self._adapting(source, rest)
+                rows.append(self._row(f'adapting, {self.audience}', answers, source))
+        return rows
+
+    def _adapting(self, source: StateSource, goals: Iterator[np.ndarray]) -> Answers:
+        """Play states while the policy adapts to one goal after the other."""
         due_s = 0.0
         seconds = round(self.duration_s)
         bar = tqdm(total=seconds, unit='s', desc='adapting')
@@ -133,13 +152,12 @@ class RosBenchmark(Benchmark):
         def supersede(elapsed_s: float) -> None:
             nonlocal due_s
             if elapsed_s >= due_s:
-                source.send_goal(next(rest), self.seed)
+                source.send_goal(next(goals), self.seed)
                 due_s += self.goal_every_s
                 bar.update(min(round(due_s), seconds) - bar.n)
 
         with bar:
-            adapting = source.play(self.duration_s, every=supersede)
-        return [idle, self._row('adapting', adapting, source)]
+            return source.play(self.duration_s, every=supersede)
 
     def _row(self, name: str, answers: Answers, source: StateSource) -> dict[str, Any]:
         latencies = answers.latencies_ms()
