@@ -50,6 +50,14 @@ def test_longer_run_equals_one_that_was_as_long_from_the_start(data, tmp_path):
     assert (kept['seed'], kept['training']['steps'], kept['hidden']) == (3, 9, [8])
 
 
+def test_time_limit_is_of_one_call_alone(data, tmp_path):
+    out = tmp_path / 'run'
+    with pytest.raises(SystemExit, match='75'):
+        pretrained(data, out, **{'time-limit': 1e-9})
+    pretrain.main(['--out', str(out), '--resume'])
+    assert steps_done(out / 'checkpoint') == 6
+
+
 def test_post_training_continues_by_its_folder_alone(data, tmp_path):
     base = pretrained(data, tmp_path / 'base') / 'checkpoint'
     straight, extended = tmp_path / 'straight', tmp_path / 'extended'

@@ -13,8 +13,9 @@ class Resumable(Settings):
     """Settings of a program that continues what an interrupted call left.
 
     A setting whose dotted name is in `may_change` does not decide the result and may differ when
-    a run is resumed; a number of steps in `may_grow` may rise, which extends the run. All others
-    are those of the interrupted call, and flags or presets that contradict them are refused.
+    a run is resumed; a number of steps in `may_grow` may rise, which extends the run. A time limit
+    is each call's own. All others are those of the interrupted call, and flags or presets that
+    contradict them are refused.
     """
 
     may_change: ClassVar[frozenset[str]] = frozenset()
@@ -76,7 +77,7 @@ def continued(
         return given
     file, values = kept
     try:
-        here = given.model_dump(include={given.place, 'resume'})
+        here = given.model_dump(include={given.place, 'resume', 'time_limit'})
         was = type(given).model_validate({**values, **here})
     except ValidationError as error:
         lines = '; '.join(error_lines(error))
