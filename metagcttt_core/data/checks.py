@@ -84,8 +84,6 @@ def flags(values: np.ndarray, name: str, where: str) -> np.ndarray:
         DatasetError: If they are neither booleans nor zeros and ones of that shape.
     """
     array = np.asanyarray(values)
-    if array.ndim == 2 and array.shape[1] == 1:
-        array = array[:, 0]
     if array.ndim != 1:
         raise DatasetError(f'{where}: {name} must have shape (rows,), got {array.shape}')
     if array.dtype == np.bool_:
@@ -139,11 +137,10 @@ def is_following(name: str) -> bool:
 def take_ends(arrays: dict[str, np.ndarray], where: str) -> np.ndarray:
     """The rows that end a trajectory, by `terminals` and all `END_MARKS`, which are taken out.
 
-    Others that look like marks, such as numbers of episodes and steps, are taken out where they
-    tell nothing else.
+    Counts of steps and their kin are taken out where they tell of no other ends.
 
     Raises:
-        DatasetError: If a mark is no flag for each row, or another one tells of other ends.
+        DatasetError: If a mark is no flag for each row, or another array looks like a mark.
     """
     ends = flags(arrays.pop('terminals'), 'terminals', where)
     for name in [name for name in END_MARKS if name in arrays]:
@@ -156,7 +153,7 @@ def take_ends(arrays: dict[str, np.ndarray], where: str) -> np.ndarray:
     for name in [name for name in arrays if looks_like_a_mark(name, of_rows=True)]:
         if _is_table(arrays[name], len(ends)):
             continue
-        if _tells_more(arrays.pop(name), ends):
+        if _tells_more(arrays.pop(name), ends) or looks_like_a_mark(name):
             raise DatasetError(
                 f'{where}: {name} looks like a mark of trajectories and is not understood: remove '
                 f'it, or give it one of the names {", ".join(END_MARKS)} (true on last rows)'
