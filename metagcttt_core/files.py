@@ -5,18 +5,24 @@ only if it carries our mark, results replace only results of ours, and no link i
 nothing that somebody else made is ever deleted.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+import hashlib
 import json
 import os
 from pathlib import Path
+import re
 import shutil
 import tempfile
-from typing import Any, IO
+from typing import Any, IO, TypeVar
 
 PICTURE_MARK = 'metagcttt'
 """The text in a PNG or GIF by which it is known as ours."""
 
+WEIGHTS = r'weights-[0-9a-f]{16}\.safetensors'
+"""Names of files of weights: by the hash of their content."""
+
+_T = TypeVar('_T')
 _MARK = '.made-by-metagcttt'
 _PICTURES = ('.png', '.gif')
 _PROVENANCE = {'commit', 'versions'}
@@ -105,6 +111,60 @@ def _object(place: Path | str, text: bytes) -> dict[str, Any]:
 def not_through_links(path: str, flags: int) -> int:
     """An `opener` for `open` that refuses a symbolic link."""
     return os.open(path, flags | os.O_NOFOLLOW, 0o666)
+
+
+def weights_name(content: bytes) -> str:
+    """The name of a file of weights."""
+    return f'weights-{hashlib.sha256(content).hexdigest()[:16]}.safetensors'
+
+
+def write_with_weights(index: Path, content: Mapping[str, Any], weights: bytes) -> None:
+    """Write a file of weights and the JSON file beside it that names them, as one.
+
+    The index is replaced last: a crash in between leaves the previous pair whole. Then weights
+    that no index names any more are removed, and what a writer left that was killed; links, and
+    files whose content is not that of their name, are somebody else's and stay.
+
+    Args:
+        index: The JSON file.
+        content: What it holds; names the weights by `weights_name`.
+        weights: The content of the file of weights.
+
+    Raises:
+        OSError: If one cannot be written. The previous pair is still there.
+    """
+    name = weights_name(weights)
+    with atomic_write(index.parent / name) as file:
+        file.write(weights)
+    write_json(index, content)
+    part = re.compile(rf'\.({WEIGHTS}|{re.escape(index.name)})\.\w{{8}}')
+    for old in index.parent.iterdir():
+        if old.name == name or old.is_symlink() or not old.is_file():
+            continue
+        whole = re.fullmatch(WEIGHTS, old.name)
+        if part.fullmatch(old.name) or (whole and weights_name(old.read_bytes()) == old.name):
+            old.unlink()
+
+
+def read_with_weights(
+    read_index: Callable[[], _T], weights: Callable[[_T], Path]
+) -> tuple[_T, bytes]:
+    """An index and the content of its weights, of one save even while the next one replaces it.
+
+    Args:
+        read_index: Reads the index.
+        weights: The file of weights that an index names.
+
+    Raises:
+        OSError: If the weights cannot be read.
+    """
+    while True:
+        index = read_index()
+        try:
+            return index, weights(index).read_bytes()
+        except FileNotFoundError:
+            if weights(read_index()) == weights(index):
+                raise
 
 
 def refuse_foreign(record: Path, *others: Path) -> None:

@@ -53,7 +53,7 @@ class Registry(MutableMapping[str, T]):
         Raises:
             ValueError: If there is none; says which name comes closest.
         """
-        if name in self:
+        if isinstance(name, str) and name in self:
             return name
         close = get_close_matches(str(name), self, n=1)
         hint = f'; did you mean {close[0]!r}?' if close else ''

@@ -132,13 +132,20 @@ class Agent(nn.Module, ABC):
         return (parameter for parameter in module.parameters() if parameter.requires_grad)
 
     def fingerprint(self) -> str:
-        """Hash of all weights, 16 hexadecimal digits."""
+        """Hash of all that decides how it acts and adapts, 16 hexadecimal digits.
+
+        That is the weights, the scaling, the settings, and the optimiser state of pre-training.
+        """
         digest = hashlib.blake2b(digest_size=8)
-        for name, weight in self.state_dict().items():
-            digest.update(f'{name}{tuple(weight.shape)}'.encode())
-            digest.update(weight.cpu().numpy().tobytes())
+        tensors = dict(self.state_dict())
+        for number, state in (self.optimizer_state or {}).items():
+            tensors |= {f'{number}.{name}': tensor for name, tensor in state.items()}
+        for name, tensor in sorted(tensors.items()):
+            digest.update(f'{name}{tuple(tensor.shape)}'.encode())
+            digest.update(tensor.cpu().numpy().tobytes())
         if not self.scaling.is_identity:
             digest.update(repr(self.scaling.to_json()).encode())
+        digest.update(f'{self.name} {self.settings.model_dump_json()}'.encode())
         return digest.hexdigest()
 
     def clone(self) -> Self:

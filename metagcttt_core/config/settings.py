@@ -7,6 +7,9 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, model_validator, ValidationError
 from pydantic_core import ErrorDetails
 
+_LONGEST = 200
+"""Characters of a wrong value that a message shows."""
+
 
 class UnknownSettingError(ValueError):
     """A key that is no setting; `key` is the one."""
@@ -67,5 +70,14 @@ def error_line(problem: ErrorDetails) -> str:
     """One problem of a `pydantic.ValidationError` as a readable line."""
     field = '.'.join(str(part) for part in problem['loc'])
     message = problem['msg'].removeprefix('Value error, ')
-    got = '' if isinstance(problem['input'], dict | BaseModel) else f', got {problem["input"]!r}'
+    given = problem['input']
+    got = '' if isinstance(given, dict | BaseModel) else f', got {_in_short(given)}'
     return f'{field}: {message}{got}' if field else f'{message}{got}'
+
+
+def _in_short(value: Any) -> str:
+    try:
+        text = repr(value)
+    except ValueError:  # which Python does not write out
+        return 'a number of thousands of digits'
+    return text if len(text) <= _LONGEST else f'{text[:_LONGEST]}...'

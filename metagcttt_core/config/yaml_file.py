@@ -12,6 +12,8 @@ from metagcttt_core.config.settings import error_line, Settings, UnknownSettingE
 
 SettingsT = TypeVar('SettingsT', bound=Settings)
 
+_MOST_BYTES = 1 << 17
+"""A file of settings has thousands; a larger one is something else and takes minutes to parse."""
 _MOST_NODES = 100_000
 """A file of settings has hundreds; anchors that refer to anchors make billions of a few lines."""
 
@@ -55,9 +57,13 @@ def read_yaml(path: Path | Traversable) -> tuple[yaml.MappingNode, dict[str, Any
             twice, or its anchors multiply beyond any settings.
     """
     try:
-        text = path.read_text(encoding='utf-8')
-    except (OSError, UnicodeDecodeError) as error:
+        with path.open('rb') as file:
+            content = file.read(_MOST_BYTES + 1)
+        text = content.decode()
+    except (OSError, ValueError) as error:
         raise SettingsFileError(f'{path}: cannot be read ({error})') from error
+    if len(content) > _MOST_BYTES:
+        raise SettingsFileError(f'{path}: is no file of settings, it has over {_MOST_BYTES} bytes')
     try:
         root = yaml.compose(text, Loader=yaml.SafeLoader)
         if not isinstance(root, yaml.MappingNode):

@@ -20,6 +20,11 @@ END_MARKS = (
 """Arrays that mark the last rows of trajectories, beside `terminals`."""
 
 _LIKE_A_MARK = re.compile(r'timeout|trunc|termin|done|episode|traj|first|last|start|end|reset')
+_LIKE_A_MARK_OF_ROWS = re.compile(
+    r'(?<![a-z])(masks?|discounts?|(time)?steps?|segments?|rollouts?|valids|boundary|boundaries|'
+    r'final|finished|eps|demos?|runs?|ids?|idx|index)(?![a-z])'
+)
+_FOLLOWING = re.compile(r'next_(obs|observations?|states?)|(obs|observations?|states?)_next')
 _CHUNK_ROWS = 1 << 20
 _JUMP = 30.0  # times the longest of ordinary steps
 _log = logging.getLogger(__name__)
@@ -113,13 +118,26 @@ def finite(array: np.ndarray, name: str, where: str) -> None:
             )
 
 
-def looks_like_a_mark(name: str) -> bool:
-    """True if an array of that name may say where trajectories begin or end."""
-    return bool(_LIKE_A_MARK.search(name.lower()))
+def looks_like_a_mark(name: str, *, of_rows: bool = False) -> bool:
+    """True for the name of an array that may say where trajectories end.
+
+    Args:
+        name: The name.
+        of_rows: The array has a value for each row: then numbers of episodes and steps, too.
+    """
+    words = re.sub(r'(?<=[a-z])(?=[A-Z])', '_', name).lower()
+    return bool(_LIKE_A_MARK.search(words) or (of_rows and _LIKE_A_MARK_OF_ROWS.search(words)))
+
+
+def is_following(name: str) -> bool:
+    """True for the name of the observations after each row."""
+    return bool(_FOLLOWING.fullmatch(name.lower()))
 
 
 def take_ends(arrays: dict[str, np.ndarray], where: str) -> np.ndarray:
     """The rows that end a trajectory, by `terminals` and all `END_MARKS`, which are taken out.
+
+    Counts of steps and their kin are taken out where they tell of no other ends.
 
     Raises:
         DatasetError: If a mark is no flag for each row, or another array looks like a mark.
@@ -132,8 +150,10 @@ def take_ends(arrays: dict[str, np.ndarray], where: str) -> np.ndarray:
                 f'{where}: {name} has {len(mark)} rows but terminals has {len(ends)}'
             )
         ends = ends | mark
-    for name in arrays:
-        if looks_like_a_mark(name):
+    for name in [name for name in arrays if looks_like_a_mark(name, of_rows=True)]:
+        if _is_table(arrays[name], len(ends)):
+            continue
+        if _tells_more(arrays.pop(name), ends) or looks_like_a_mark(name):
             raise DatasetError(
                 f'{where}: {name} looks like a mark of trajectories and is not understood: remove '
                 f'it, or give it one of the names {", ".join(END_MARKS)} (true on last rows)'
@@ -141,17 +161,40 @@ def take_ends(arrays: dict[str, np.ndarray], where: str) -> np.ndarray:
     return ends
 
 
+def _is_table(array: np.ndarray, rows: int) -> bool:
+    """True for several numbers a row, which are no mark."""
+    return array.ndim > 1 and len(array) == rows and array.size > rows
+
+
+def _tells_more(mark: np.ndarray, ends: np.ndarray) -> bool:
+    """Whether a mark changes inside a trajectory, other than by equal steps.
+
+    The first and the last row of a trajectory may differ from those between.
+    """
+    if mark.size != len(ends) or len(mark) != len(ends):
+        return True
+    edges = ends.copy()
+    edges[1:] |= ends[:-1]
+    edges[0] = True
+    inside = ~(edges[:-1] | edges[1:])
+    values = mark.reshape(-1)
+    if values.dtype.kind in 'bfiu':
+        steps = np.diff(values.astype(np.float64))[inside]
+        return bool(len(steps)) and not (steps == steps[0]).all()  # nan is unequal, too
+    return bool((values[1:] != values[:-1])[inside].any())
+
+
 def following_rows(
-    observations: np.ndarray, following: np.ndarray, ends: np.ndarray, where: str
+    observations: np.ndarray, following: np.ndarray, ends: np.ndarray, name: str, where: str
 ) -> None:
-    """Refuse `next_observations` that are not the observations of the next row.
+    """Refuse `next_observations`, by whatever name, that are not those of the next row.
 
     Raises:
         DatasetError: With the first row of a transition that leads somewhere else.
     """
     if following.shape != observations.shape:
         raise DatasetError(
-            f'{where}: next_observations has shape {following.shape}, observations has '
+            f'{where}: {name} has shape {following.shape}, observations has '
             f'{observations.shape}; they must match'
         )
     for start, part in _chunks(following[:-1]):
@@ -161,7 +204,7 @@ def following_rows(
         if len(wrong):
             row = start + int(wrong[0])
             raise DatasetError(
-                f'{where}: next_observations of row {row} is not observation {row + 1}, and no '
+                f'{where}: {name} of row {row} is not observation {row + 1}, and no '
                 'trajectory ends there: store rows in the order of time'
             )
 
@@ -183,11 +226,11 @@ def warn_of_oddities(
         steps = np.abs(np.diff(part[:, :2], axis=0)).max(axis=1) * inside
         if len(steps) and steps.max() > longest:
             longest, row = float(steps.max()), start + int(steps.argmax())
-        if inside.any():
-            ordinary = max(ordinary, float(np.quantile(steps[inside], 0.99, method='lower')))
+        if (moved := steps[steps > 0]).size:
+            ordinary = max(ordinary, float(np.quantile(moved, 0.9, method='lower')))
     if ordinary and longest > _JUMP * ordinary:
         _log.warning(
-            '%s: from row %d to the next the first two numbers jump by %.3g, where 99 %% of the '
+            '%s: from row %d to the next the first two numbers jump by %.3g, where 90 %% of the '
             'steps are below %.3g: does a trajectory end there?',
             where,
             row,

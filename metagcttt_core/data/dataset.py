@@ -152,14 +152,20 @@ class TrajectoryDataset:
             )
         ends = checks.take_ends(arrays, str(path))
         observations, actions = arrays.pop('observations'), arrays.pop('actions')
-        following = arrays.pop('next_observations', None)
+        shape = observations.shape
+        following = {
+            name: arrays.pop(name)
+            for name in list(arrays)
+            if checks.is_following(name)
+            and (name == 'next_observations' or arrays[name].shape == shape)
+        }
         contract = None if minari.is_minari(path) else npz.read_json(path, CONTRACT)
         dataset = cls.from_arrays(
             observations, actions, ends, arrays, source=path, contract=contract
         )
-        if following is not None:
-            following = following - dataset.origin if dataset.origin.any() else following
-            checks.following_rows(dataset.observations, following, ends, str(path))
+        for name, states in following.items():
+            states = states - dataset.origin if dataset.origin.any() else states
+            checks.following_rows(dataset.observations, states, ends, name, str(path))
         return dataset
 
     def save(self, path: str | Path) -> None:
@@ -216,7 +222,7 @@ class TrajectoryDataset:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Hash of all observations, actions and terminals, 16 hexadecimal digits."""
+        """Hash of observations, actions, terminals and contract, 16 hexadecimal digits."""
         digest = hashlib.blake2b(digest_size=8)
         for array in (self.observations, self.actions, self.terminals):
             digest.update(f'{array.dtype.str}{array.shape}'.encode())
@@ -224,6 +230,8 @@ class TrajectoryDataset:
                 digest.update(np.ascontiguousarray(array[start : start + _CHUNK_ROWS]).data)
         if self.origin.any():
             digest.update(self.origin.data)
+        if self.contract:
+            digest.update(json.dumps(self.contract, sort_keys=True).encode())
         return digest.hexdigest()
 
     def episode_of(self, rows: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from metagcttt_core.data.bounds import check_announced, check_memory
-from metagcttt_core.data.checks import looks_like_a_mark
+from metagcttt_core.data.checks import END_MARKS, is_following, looks_like_a_mark
 from metagcttt_core.data.errors import DatasetError
 
 SUFFIXES = ('.hdf5', '.h5')
@@ -110,6 +110,13 @@ def _episode(file: Any, name: str, path: Path) -> dict[str, np.ndarray]:
             f'{path}: {name} has {len(actions)} actions but {len(observations)} observations, '
             f'expected {num_rows}'
         )
+    for mark in filter(group.__contains__, END_MARKS):
+        before = np.flatnonzero(_vector(group, mark, path)[: len(actions) - 1])
+        if len(before):
+            raise DatasetError(
+                f'{path}: {name} ends after transition {before[0]} by its {mark}, but has '
+                f'{len(actions)}: store what comes after an end as another episode'
+            )
     rows = {'observations': observations, **_infos(group, num_rows, path)}
     rows['actions'] = np.concatenate([actions, np.zeros_like(actions[:1])])
     rows['terminals'] = np.arange(num_rows) == num_rows - 1
@@ -121,14 +128,27 @@ def _flat(file: Any, path: Path) -> dict[str, np.ndarray]:
     for required in ('actions', 'terminals'):
         if required not in file:
             raise DatasetError(f'{path}: has no {required}; found: {", ".join(file)}')
-    names = ['observations', 'actions', 'next_observations']
-    rows = {name: _array(file, name, path) for name in names if name in file}
-    for name in filter(looks_like_a_mark, file):
-        node = _member(file, name, path)
-        if getattr(node, 'shape', None) != (len(rows['observations']),):
-            raise DatasetError(f'{path}: {name} must have a value for each row')
-        rows[name] = _stored(node, name, path)
-    return {**rows, **_infos(file, len(rows['observations']), path)}
+    names = ['observations', 'actions', *filter(is_following, file)]
+    rows = {name: _array(file, name, path) for name in names}
+    num_rows = len(rows['observations'])
+    infos = _own_member(file, 'infos')
+    for group in (file, infos) if hasattr(infos, 'keys') else (file,):
+        for name in group:
+            rows |= _mark(group, name, num_rows, path)
+    return {**rows, **_infos(file, num_rows, path)}
+
+
+def _mark(group: Any, name: str, num_rows: int, path: Path) -> dict[str, np.ndarray]:
+    """An array that may say where trajectories end, by its name; empty if it is none."""
+    node = _own_member(group, name)
+    shape = getattr(node, 'shape', None)
+    of_rows = shape in ((num_rows,), (num_rows, 1))
+    if not looks_like_a_mark(name, of_rows=of_rows):
+        return {}
+    node = _member(group, name, path)
+    if not of_rows and (shape is None or len(shape) < 2 or shape[0] != num_rows):
+        raise DatasetError(f'{path}: {name} must have a value for each row')
+    return {name: _stored(node, name, path)} if of_rows else {}
 
 
 def _infos(group: Any, num_rows: int, path: Path) -> dict[str, np.ndarray]:
@@ -196,6 +216,14 @@ def _array(group: Any, name: str, path: Path) -> np.ndarray:
         got = f'{node.dtype} of shape {node.shape}' if hasattr(node, 'dtype') else 'a group'
         raise DatasetError(f'{path}: {name} must be numbers of shape (rows, numbers), got {got}')
     return _stored(node, name, path)
+
+
+def _vector(group: Any, name: str, path: Path) -> np.ndarray:
+    """One stored array of a value for each step; anything else is refused."""
+    node = _member(group, name, path)
+    if not hasattr(node, 'dtype') or node.dtype.kind not in 'bfiu' or len(node.shape) != 1:
+        raise DatasetError(f'{path}: {group.name[1:]}/{name} must be a flag for each step')
+    return _stored(node, f'{group.name[1:]}/{name}', path)
 
 
 def _stored(node: Any, name: str, path: Path) -> np.ndarray:

@@ -128,7 +128,7 @@ def _chosen(path: Path, archive: zipfile.ZipFile, required: Sequence[str]) -> di
         if name in required
         or rows is None
         or (member.shape[:1] == rows and member.dtype.kind in 'bfiu')
-        or (member.shape and looks_like_a_mark(name))
+        or (member.shape and looks_like_a_mark(name, of_rows=member.shape[:1] == rows))
     }
     if left_out := sorted(members.keys() - chosen.keys()):
         _log.info('%s: left out %s, which are no rows of numbers', path, ', '.join(left_out))

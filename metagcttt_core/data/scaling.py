@@ -17,6 +17,10 @@ _FROZEN = 1e-6
 """Deviation of an observed value, relative to its size, from which it counts as constant."""
 
 
+_LARGEST = 1e15
+"""Far beyond any unit; what is scaled by it is still finite in single precision."""
+
+
 @dataclass(frozen=True, eq=False)
 class Scaling:
     """Networks see (observation - origin - mean) / std and give actions as shares of `limit`.
@@ -73,12 +77,15 @@ class Scaling:
             raise ValueError(f'scaling needs {", ".join(sizes)}, got {", ".join(given)}')
         arrays = {}
         for name, size in sizes.items():
-            arrays[name] = array = np.asarray(given[name], dtype=np.float64)
-            if array.shape != (size,) or not np.isfinite(array).all():
-                raise ValueError(f'scaling: {name} must be {size} finite numbers')
+            try:
+                arrays[name] = array = np.asarray(given[name], dtype=np.float64)
+            except (ValueError, TypeError, OverflowError) as error:
+                raise ValueError(f'scaling: {name} must be {size} numbers ({error})') from error
+            if array.shape != (size,) or not (np.abs(array) <= _LARGEST).all():
+                raise ValueError(f'scaling: {name} must be {size} numbers within {_LARGEST:g}')
         for name in ('std', 'limit'):
-            if (arrays[name] <= 0).any():
-                raise ValueError(f'scaling: {name} must be above 0')
+            if (arrays[name] < 1 / _LARGEST).any():
+                raise ValueError(f'scaling: {name} must be at least {1 / _LARGEST:g}')
         return cls(**arrays)
 
     def to_json(self) -> dict[str, list[float]]:

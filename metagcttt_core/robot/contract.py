@@ -343,7 +343,8 @@ class Contract(Settings):
         for topic in self.act:
             if topic.timeout_s < 1.0 / self.rate_hz:
                 raise ValueError(
-                    f'timeout_s of {topic.topic} is shorter than a period, {1 / self.rate_hz:g} s'
+                    f'timeout_s of {topic.topic} is {topic.timeout_s:g} s, shorter than a period '
+                    f'at rate_hz {self.rate_hz:g}, {1 / self.rate_hz:g} s'
                 )
         self._check_goal()
         return self

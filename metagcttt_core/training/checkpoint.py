@@ -2,12 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-import hashlib
 from pathlib import Path
 import re
 from typing import Any
 
-from pydantic import Field, ValidationError
+from pydantic import BaseModel, Field, field_validator, ValidationError
 from safetensors import SafetensorError
 import safetensors.torch
 import torch
@@ -17,14 +16,19 @@ from metagcttt_core.agents import AGENTS
 from metagcttt_core.agents.agent import Agent, OptimizerState
 from metagcttt_core.config.settings import error_lines, Settings
 from metagcttt_core.data.scaling import Scaling
-from metagcttt_core.files import atomic_write, read_json, write_json
+from metagcttt_core.files import (
+    read_json,
+    read_with_weights,
+    WEIGHTS,
+    weights_name,
+    write_with_weights,
+)
 
 FORMAT_VERSION = 1
 _INDEX = 'checkpoint.json'
-_WEIGHTS = r'weights-[0-9a-f]{16}\.safetensors'
-_OURS = rf'{_WEIGHTS}|\.({_WEIGHTS}|checkpoint\.json)\.\w{{8}}'
-"""Files of weights, and what a writer leaves that is killed; others are not ours to remove."""
 _PRETRAINING = 'pretrain'  # the stage
+_OPTIMIZER_TENSOR = r'(optimizer|pretraining)\.(\d{1,9})\.(\w+)'
+_NEVER_NEGATIVE = ('.step', '.exp_avg_sq')
 
 
 class CheckpointError(ValueError):
@@ -54,6 +58,14 @@ class _Training(Settings):
     settings: dict[str, Any]
 
 
+class _Metadata(BaseModel):
+    """What programs look up in the metadata; whatever else is in there is kept."""
+
+    environment: str | None = None
+    history: list[dict[str, Any]] = []
+    contract: dict[str, Any] | None = None
+
+
 class _Index(Settings):
     format: str = 'metagcttt-checkpoint'
     version: int
@@ -63,8 +75,14 @@ class _Index(Settings):
     settings: dict[str, Any]
     metadata: dict[str, Any]
     scaling: dict[str, Any] | None = None
-    weights: str = Field(pattern=rf'^{_WEIGHTS}$')
+    weights: str = Field(pattern=rf'^{WEIGHTS}$')
     training: _Training | None = None
+
+    @field_validator('metadata')
+    @classmethod
+    def _check_metadata(cls, metadata: dict[str, Any]) -> dict[str, Any]:
+        _Metadata.model_validate(metadata)
+        return metadata
 
 
 def save_checkpoint(agent: Agent, path: str | Path, training: TrainingState | None = None) -> None:
@@ -97,7 +115,6 @@ def save_checkpoint(agent: Agent, path: str | Path, training: TrainingState | No
             what = name if (weight := name.removeprefix('agent.')) == name else f'weight {weight}'
             raise CheckpointError(f'{folder}: not saved, {what} holds a non-finite value')
     content = safetensors.torch.save({name: t.contiguous().cpu() for name, t in tensors.items()})
-    weights = f'weights-{hashlib.sha256(content).hexdigest()[:16]}.safetensors'
     index = _Index(
         version=FORMAT_VERSION,
         agent=agent.name,
@@ -106,18 +123,13 @@ def save_checkpoint(agent: Agent, path: str | Path, training: TrainingState | No
         settings=agent.settings.model_dump(mode='json'),
         metadata=agent.metadata,
         scaling=None if agent.scaling.is_identity else agent.scaling.to_json(),
-        weights=weights,
+        weights=weights_name(content),
         training=training
         and _Training(stage=training.stage, step=training.step, settings=training.settings),
     )
-    with atomic_write(folder / weights) as file:
-        file.write(content)
     # Without a scaling, programs of before there was one can read it.
     unused = set() if index.scaling else {'scaling'}
-    write_json(folder / _INDEX, index.model_dump(mode='json', exclude=unused))
-    for old in folder.iterdir():
-        if re.fullmatch(_OURS, old.name) and old.name != weights and not old.is_symlink():
-            old.unlink()
+    write_with_weights(folder / _INDEX, index.model_dump(mode='json', exclude=unused), content)
 
 
 def load_checkpoint(
@@ -168,12 +180,6 @@ def load_checkpoint(
                 f'{folder}: weight {name} has shape {tuple(saved[name].shape)}, '
                 f'the settings ask for {tuple(tensor.shape)}'
             )
-        if saved[name].dtype != tensor.dtype:
-            raise CheckpointError(
-                f'{folder}: weight {name} is {saved[name].dtype}, expected {tensor.dtype}'
-            )
-        if not torch.isfinite(saved[name]).all():
-            raise CheckpointError(f'{folder}: weight {name} holds a non-finite value')
     agent = agent_type(index.obs_dim, index.act_dim, settings, torch.Generator())
     if index.scaling is not None:
         try:
@@ -183,9 +189,7 @@ def load_checkpoint(
     agent.load_state_dict(saved)
     agent.metadata = dict(index.metadata)
     own_run = index.training is not None and index.training.stage == _PRETRAINING
-    agent.optimizer_state = (
-        _state(folder, 'optimizer' if own_run else 'pretraining', tensors) or None
-    )
+    agent.optimizer_state = _state('optimizer' if own_run else 'pretraining', tensors) or None
     agent.origin = str(folder)
     return agent
 
@@ -208,11 +212,8 @@ def load_training_state(path: str | Path) -> TrainingState:
     index, tensors = _read(folder)
     if index.training is None:
         raise CheckpointError(f'{folder}: was saved without a training state, cannot be resumed')
-    for name in tensors:
-        if not name.startswith(('agent.', 'optimizer.', 'pretraining.')):
-            raise CheckpointError(f'{folder}: unknown tensor {name}')
-    optimizer = _state(folder, 'optimizer', tensors)
     training = index.training
+    optimizer = _state('optimizer', tensors)
     return TrainingState(training.stage, training.step, training.settings, optimizer)
 
 
@@ -229,18 +230,13 @@ def _named(group: str, optimizer: OptimizerState) -> dict[str, Tensor]:
     }
 
 
-def _state(folder: Path, group: str, tensors: Mapping[str, Tensor]) -> OptimizerState:
+def _state(group: str, tensors: Mapping[str, Tensor]) -> OptimizerState:
     """The inverse of `_named`; empty where there is none."""
     optimizer: OptimizerState = {}
     for name, tensor in tensors.items():
-        if not name.startswith(f'{group}.'):
-            continue
-        match = re.fullmatch(rf'{group}\.(\d+)\.(\w+)', name)
-        if match is None:
-            raise CheckpointError(f'{folder}: unknown tensor {name}')
-        if not torch.isfinite(tensor).all():
-            raise CheckpointError(f'{folder}: {name} holds a non-finite value')
-        optimizer.setdefault(int(match[1]), {})[match[2]] = tensor
+        match = re.fullmatch(_OPTIMIZER_TENSOR, name)
+        if match and match[1] == group:
+            optimizer.setdefault(int(match[2]), {})[match[3]] = tensor
     return optimizer
 
 
@@ -272,22 +268,36 @@ def _read_index(folder: Path) -> _Index:
 
 def _read(folder: Path) -> tuple[_Index, dict[str, Tensor]]:
     """The index and the tensors of one and the same save, even while the next one replaces it."""
-    while True:
-        index = _read_index(folder)
-        file = folder / index.weights
-        try:
-            return index, _tensors(file, file.read_bytes())
-        except FileNotFoundError as error:
-            if _read_index(folder).weights == index.weights:
-                raise CheckpointError(f'{file}: is missing') from error
-
-
-def _tensors(file: Path, content: bytes) -> dict[str, Tensor]:
-    if f'weights-{hashlib.sha256(content).hexdigest()[:16]}.safetensors' != file.name:
+    try:
+        index, content = read_with_weights(
+            lambda: _read_index(folder), lambda index: folder / index.weights
+        )
+    except OSError as error:
+        reason = 'is missing' if isinstance(error, FileNotFoundError) else error.strerror
+        raise CheckpointError(f'{error.filename}: {reason}') from error
+    file = folder / index.weights
+    if weights_name(content) != file.name:
         raise CheckpointError(
             f'{file}: is damaged, its content does not match the hash in its name'
         )
     try:
-        return safetensors.torch.load(content)
-    except SafetensorError as error:
+        tensors = safetensors.torch.load(content)
+    except (SafetensorError, KeyError) as error:  # the latter for types that PyTorch lacks
         raise CheckpointError(f'{file}: is not a safetensors file ({error})') from error
+    for name, tensor in tensors.items():
+        _check_tensor(folder, name, tensor)
+    return index, tensors
+
+
+def _check_tensor(folder: Path, name: str, tensor: Tensor) -> None:
+    """Refuse what is neither a weight nor the state of an optimiser, or cannot be used."""
+    weight = name.removeprefix('agent.')
+    what = name if weight == name else f'weight {weight}'
+    if weight == name and not re.fullmatch(_OPTIMIZER_TENSOR, name):
+        raise CheckpointError(f'{folder}: unknown tensor {name}')
+    if tensor.dtype != torch.float32:
+        raise CheckpointError(f'{folder}: {what} is {tensor.dtype}, expected {torch.float32}')
+    if not torch.isfinite(tensor).all():
+        raise CheckpointError(f'{folder}: {what} holds a non-finite value')
+    if name.endswith(_NEVER_NEGATIVE) and (tensor < 0).any():
+        raise CheckpointError(f'{folder}: {what} holds a negative value')

@@ -91,6 +91,20 @@ class KernelAdam:
         )
 
 
+def misfit(state: OptimizerState, parameters: Iterable[nn.Parameter]) -> str:
+    """Why the moments of Adam are not those of these parameters; empty if they are."""
+    for number, parameter in enumerate(parameters):
+        moments = state.get(number, {})
+        shapes = {name: tuple(moment.shape) for name, moment in moments.items()}
+        shape = tuple(parameter.shape)
+        if shapes != {'step': (), 'exp_avg': shape, 'exp_avg_sq': shape}:
+            return (
+                f'optimiser state of parameter {number}, which has shape {shape}, does not fit '
+                f'it: {shapes}'
+            )
+    return ''
+
+
 def pretrained_state(agent: Agent, *, actor_only: bool = False) -> OptimizerState:
     """Adam's state at the end of pre-training, by number in the parameters to train now.
 
@@ -109,16 +123,9 @@ def pretrained_state(agent: Agent, *, actor_only: bool = False) -> OptimizerStat
     )
     if state is None:
         raise ValueError(f'{agent.origin}: has no optimiser state of pre-training; {remedy}')
-    numbers = {}
-    for number, parameter in enumerate(agent.trained_parameters()):
-        numbers[parameter] = number
-        moments = state.get(number, {})
-        shapes = {name: tuple(moment.shape) for name, moment in moments.items()}
-        shape = tuple(parameter.shape)
-        if shapes != {'step': (), 'exp_avg': shape, 'exp_avg_sq': shape}:
-            raise ValueError(
-                f'{agent.origin}: optimiser state of parameter {number}, which has shape {shape}, '
-                f'does not fit it: {shapes}; {remedy}'
-            )
+    parameters = list(agent.trained_parameters())
+    numbers = {parameter: number for number, parameter in enumerate(parameters)}
+    if fault := misfit(state, parameters):
+        raise ValueError(f'{agent.origin}: {fault}; {remedy}')
     trained = agent.trained_parameters(actor_only=actor_only)
     return {place: state[numbers[parameter]] for place, parameter in enumerate(trained)}

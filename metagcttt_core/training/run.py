@@ -16,6 +16,7 @@ from metagcttt_core.training.checkpoint import (
     save_checkpoint,
     TrainingState,
 )
+from metagcttt_core.training.optimizers import misfit
 
 
 class TrainingInterrupted(Exception):
@@ -63,7 +64,8 @@ class TrainingRun:
         """Load the checkpoint to go on from into `agent` and `optimizer`; returns the steps done.
 
         Raises:
-            CheckpointError: If the checkpoint belongs to another stage or other settings, by name.
+            CheckpointError: If the checkpoint belongs to another stage or other settings, by name,
+                or its optimiser state does not fit.
         """
         if not self._resume or self._folder is None or not has_checkpoint(self._folder):
             return 0
@@ -84,6 +86,10 @@ class TrainingRun:
                     f'{self._folder}: cannot resume, {name} of the agent was {saved}, is {asked}'
                 )
         agent.load_state_dict(saved_agent.state_dict())
+        if isinstance(optimizer, torch.optim.Adam):
+            (group,) = optimizer.param_groups
+            if fault := misfit(state.optimizer, group['params']):
+                raise CheckpointError(f'{self._folder}: cannot resume, {fault}')
         if optimizer is not None:
             optimizer.load_state_dict({**optimizer.state_dict(), 'state': state.optimizer})
         return state.step

@@ -4,10 +4,9 @@ from dataclasses import dataclass, field
 import hashlib
 from itertools import pairwise
 from pathlib import Path
-import re
 from typing import Any, Literal, Self
 
-from metagcttt_core.files import atomic_write, write_json
+from metagcttt_core.files import read_with_weights, write_with_weights
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from safetensors import SafetensorError
@@ -17,7 +16,6 @@ from sim_bridge.controllers.follower import ControllerError
 from sim_bridge.simulator import Array
 
 _INDEX = 'controller.json'
-_WEIGHTS = re.compile(r'weights-[0-9a-f]{16}\.safetensors')
 
 
 class _Index(BaseModel):
@@ -114,7 +112,6 @@ class LearnedFollower:
         The weights go to a file named by their hash, then `controller.json`, which names that
         hash, is replaced. A crash in between leaves the previous controller whole.
         """
-        folder.mkdir(parents=True, exist_ok=True)
         index = _Index(
             robot=self.robot,
             layers=len(self.weights),
@@ -122,12 +119,7 @@ class LearnedFollower:
             sha256=self.sha256,
             metadata=self.metadata,
         )
-        with atomic_write(folder / index.weights) as file:
-            file.write(self._serialized())
-        write_json(folder / _INDEX, index.model_dump())
-        for old in folder.iterdir():
-            if _WEIGHTS.fullmatch(old.name) and old.name != index.weights:
-                old.unlink()
+        write_with_weights(folder / _INDEX, index.model_dump(), self._serialized())
 
     @classmethod
     def load(cls, folder: Path) -> Self:
@@ -137,8 +129,11 @@ class LearnedFollower:
             ControllerError: If there is none, or it is damaged; the message names the file.
         """
         try:
-            index = _Index.model_validate_json((folder / _INDEX).read_bytes())
-            tensors = safetensors.numpy.load((folder / index.weights).read_bytes())
+            index, content = read_with_weights(
+                lambda: _Index.model_validate_json((folder / _INDEX).read_bytes()),
+                lambda index: folder / index.weights,
+            )
+            tensors = safetensors.numpy.load(content)
             layers = range(index.layers)
             follower = cls(
                 index.robot,

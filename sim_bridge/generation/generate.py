@@ -168,7 +168,7 @@ def _settings(plan: GenerationPlan, follower: DirectionFollower) -> dict[str, An
 
 
 def _refuse_existing(paths: OutputPaths, begun: bool) -> None:
-    if paths.partial.exists():
+    if ChunkFolder(paths.partial).exists():
         raise GenerationError(
             f'{paths.partial} holds an unfinished dataset: resume it or overwrite it'
         )

@@ -9,9 +9,12 @@ from metagcttt_core.files import (
     claim_folder,
     not_through_links,
     PICTURE_MARK,
+    read_with_weights,
     refuse_foreign,
     remove_claimed,
+    weights_name,
     write_json,
+    write_with_weights,
 )
 import pytest
 
@@ -150,3 +153,30 @@ def test_a_picture_is_known_by_its_mark(tmp_path):
         refuse_foreign(picture)
     picture.write_bytes(PICTURE_MARK.encode())
     refuse_foreign(picture)
+
+
+def test_old_weights_and_parts_are_removed_but_nothing_of_somebody_else(tmp_path):
+    index = tmp_path / 'run' / 'index.json'
+    write_with_weights(index, {'weights': weights_name(b'old')}, b'old')
+    theirs = index.parent / f'weights-{"0" * 16}.safetensors'  # no hash of its content
+    folder = index.parent / f'weights-{"1" * 16}.safetensors'
+    link, elsewhere = index.parent / weights_name(b'linked'), tmp_path / 'elsewhere'
+    theirs.write_text('four years of work')
+    folder.mkdir()
+    elsewhere.write_bytes(b'linked')
+    link.symlink_to(elsewhere)
+    for left in (f'.{weights_name(b"killed")}.ab12cd34', '.index.json.ab12cd34'):
+        (index.parent / left).write_text('{"cut')
+    write_with_weights(index, {'weights': weights_name(b'new')}, b'new')
+    kept = {index.name, weights_name(b'new'), theirs.name, folder.name, link.name}
+    assert {path.name for path in index.parent.iterdir()} == kept
+    assert theirs.read_text() == 'four years of work'
+    assert elsewhere.read_bytes() == b'linked'
+
+
+def test_weights_are_those_of_the_index_while_another_pair_takes_its_place(tmp_path):
+    (tmp_path / 'new').write_bytes(b'new')
+    indices = iter(['old', 'new', 'new'])
+    assert read_with_weights(lambda: next(indices), tmp_path.joinpath) == ('new', b'new')
+    with pytest.raises(FileNotFoundError, match='old'):
+        read_with_weights(lambda: 'old', tmp_path.joinpath)

@@ -54,7 +54,7 @@ def test_names_are_listed_without_importing_anything_of_another_package(registry
 
 @pytest.mark.filterwarnings('ignore:thing .join.')
 @pytest.mark.parametrize(
-    ('name', 'hint'), [('mien', "; did you mean 'mine'?"), ('xyz', ''), (None, '')]
+    ('name', 'hint'), [('mien', "; did you mean 'mine'?"), ('xyz', ''), (None, ''), ({'a': 1}, '')]
 )
 def test_unknown_name_is_refused_with_the_nearest(name, hint, registry) -> None:
     with pytest.raises(ValueError, match='unknown thing') as refused:

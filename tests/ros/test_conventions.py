@@ -143,6 +143,20 @@ def test_override_that_is_none_is_refused_by_name(graph: Graph, policy: str, val
         graph.add(SimBridgeNode, **{f'qos_overrides./state.publisher.{policy}': value})
 
 
+def test_parameter_that_the_node_does_not_have_is_named(graph: Graph) -> None:
+    logs = graph.collect(Log, '/rosout')
+    given = {'speed_factr': 2.0, 'qos_overrides./state.publisher.depht': 7, 'seed': 3}
+    graph.add(SimBridgeNode, **given)
+    expected = [
+        'there is no parameter qos_overrides./state.publisher.depht, it is ignored; did you mean '
+        'qos_overrides./state.publisher.depth?',
+        'there is no parameter speed_factr, it is ignored; did you mean speed_factor?',
+    ]
+    graph.wait(lambda: len(warnings(logs)) > 1, 'the warnings')
+    graph.wait_for(1.5)
+    assert warnings(logs) == expected
+
+
 def test_topic_with_two_types_is_named(graph: Graph, other_process: Graph) -> None:
     logs = graph.collect(Log, '/rosout')
     bridge = graph.add(RobotBridgeNode, contract=str(CONTRACT))

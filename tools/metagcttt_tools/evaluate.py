@@ -107,7 +107,7 @@ def main(argv: list[str] | None = None) -> None:
     settings = parse(EvaluateSettings, _DESCRIPTION, 'evaluate', arguments)
     try:
         with sole_writer(settings.out, settings.out):
-            marks = fingerprints(settings.dataset, settings.checkpoints)
+            marks = fingerprints(settings.dataset, settings.checkpoints, settings.actor_loss)
             done = finished_before(settings, marks)
             results = done['results'] if done else evaluate(settings, settings, marks)
             if not done:
@@ -213,11 +213,14 @@ def finished_jobs(out: Path) -> Path:
     return out.with_suffix('.partial.jsonl')
 
 
-def fingerprints(dataset: Path, checkpoints: Sequence[Path]) -> dict[str, Any]:
-    """Hashes of the dataset and of the policies."""
+def fingerprints(
+    dataset: Path, checkpoints: Sequence[Path], actor_loss: ActorLoss | None = None
+) -> dict[str, Any]:
+    """Hashes of the dataset and of the policies, as they are adapted."""
     from metagcttt_core import load_checkpoint
 
-    policies = [load_checkpoint(path).fingerprint() for path in checkpoints]
+    changes = {'actor_loss': actor_loss} if actor_loss else {}
+    policies = [load_checkpoint(path, changes=changes).fingerprint() for path in checkpoints]
     return {'dataset': TrajectoryDataset.load(dataset).fingerprint, 'policies': policies}
 
 

@@ -61,7 +61,7 @@ def main(argv: list[str] | None = None) -> None:
         )
         picture = settings.out.with_suffix('.png')
         with sole_writer(settings.out, settings.out, picture):
-            marks = fingerprints(evaluation.dataset, evaluation.checkpoints)
+            marks = fingerprints(evaluation.dataset, evaluation.checkpoints, evaluation.actor_loss)
             done = finished_before(settings, marks)
             rows = done['results']['curve'] if done else _rows(evaluation, settings, steps, marks)
             if not done:

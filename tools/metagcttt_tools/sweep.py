@@ -330,7 +330,9 @@ def _jobs(tool: str, runs: Sequence[Any]) -> list[Job]:
 def _is_up_to_date(settings: EvaluateSettings) -> bool:
     """False if the data or policies have changed since they were evaluated."""
     kept = read_json(settings.out).get('fingerprints')
-    return kept is None or kept == fingerprints(settings.dataset, settings.checkpoints)
+    return kept is None or kept == fingerprints(
+        settings.dataset, settings.checkpoints, settings.actor_loss
+    )
 
 
 def is_evaluated(settings: EvaluateSettings) -> bool:

@@ -243,3 +243,24 @@ def test_batch_becomes_tensors_of_the_same_values():
     tensors = tiny_agent().tensors(batch)
     assert tensors['observations'].tolist() == batch['observations'].tolist()
     assert tensors['observations'].dtype == torch.float32
+
+
+def test_fingerprint_tells_policies_apart_that_act_or_adapt_differently():
+    def fingerprint(state=None, **settings):
+        agent = tiny_agent('gciql', **settings)
+        agent.optimizer_state = state
+        return agent.fingerprint()
+
+    different = [
+        fingerprint(),
+        fingerprint(discount=0.9),
+        fingerprint(expectile=0.8),
+        fingerprint(alpha=7.0),
+        fingerprint(actor_loss='bc'),
+        fingerprint({0: {'exp_avg': torch.zeros(2)}}),
+        fingerprint({0: {'exp_avg': torch.ones(2)}}),
+        tiny_agent('gciql', seed=1).fingerprint(),
+    ]
+    assert len(set(different)) == len(different)
+    assert fingerprint() == fingerprint()
+    assert tiny_agent('gciql').clone().fingerprint() == fingerprint()

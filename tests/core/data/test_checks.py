@@ -45,11 +45,45 @@ def test_trajectories_end_at_every_mark(tmp_path, name, dtype):
         ('episode_id', np.arange(60) // 30),
         ('episode_starts', np.array([0, 30])),
         ('traj_lengths', np.array([30, 30])),
+        ('masks', 1.0 - flags(29, 59)),
+        ('discounts', np.where(flags(29, 59), 0.0, 0.99)),
+        ('step_type', np.where(flags(29, 59), 2, 1)),
+        ('timesteps', np.arange(60) % 30),
+        ('runId', np.array(['a', 'b']).repeat(30)),
+        ('valids', (1 - flags(29, 59))[:, None]),
     ],
 )
 def test_unknown_mark_is_refused_by_name(tmp_path, name, array):
     with pytest.raises(DatasetError, match=rf'data\.npz: {name} looks like a mark of trajector'):
         TrajectoryDataset.load(saved(tmp_path, **{name: array}))
+
+
+@pytest.mark.parametrize(
+    ('name', 'array'),
+    [
+        ('run_id', np.arange(60) // 30),
+        ('masks', 1.0 - flags(29, 59)),
+        ('timesteps', np.arange(60) % 30),
+        ('step_type', np.repeat([[0, *[1] * 28, 2]], 2, axis=0).reshape(-1)),
+        ('runId', np.array(['a', 'b']).repeat(30)),
+    ],
+)
+def test_mark_that_tells_nothing_new_is_left_out(tmp_path, name, array):
+    path = saved(tmp_path, timeouts=flags(29), **{name: array})
+    dataset = TrajectoryDataset.load(path)
+    assert (dataset.episode_ends.tolist(), dataset.extras) == ([29, 59], {})
+
+
+def test_several_numbers_a_row_are_no_mark(tmp_path):
+    dataset = TrajectoryDataset.load(saved(tmp_path, end_effector=walk()['observations']))
+    assert set(dataset.extras) == {'end_effector'}
+
+
+def test_jumps_of_short_trajectories_are_logged(tmp_path, caplog):
+    rows = np.vstack([walk(12, seed, 9.0 * seed)['observations'] for seed in range(5)])
+    with caplog.at_level(logging.WARNING):
+        TrajectoryDataset.load(saved(tmp_path, observations=rows))
+    assert 'jump by 9' in caplog.text
 
 
 def test_what_is_no_row_of_numbers_is_left_out(tmp_path):
@@ -77,9 +111,10 @@ def test_next_observations_in_another_order_are_refused(tmp_path):
     rows = walk()
     following = np.vstack([rows['observations'][1:], rows['observations'][-1:]])
     shuffled = {name: array[order] for name, array in rows.items()}
-    path = saved(tmp_path, **shuffled, next_observations=following[order])
-    with pytest.raises(DatasetError, match='next_observations of row 0 is not observation 1'):
-        TrajectoryDataset.load(path)
+    for name in ('next_observations', 'next_obs', 'observations_next', 'next_state'):
+        path = saved(tmp_path, **shuffled, **{name: following[order]})
+        with pytest.raises(DatasetError, match=f'{name} of row 0 is not observation 1'):
+            TrajectoryDataset.load(path)
     path = saved(tmp_path, next_observations=following[:, :1])
     with pytest.raises(DatasetError, match=r'next_observations has shape \(60, 1\)'):
         TrajectoryDataset.load(path)

@@ -260,6 +260,14 @@ def far_number(file):
     point_episode(file, 10**12)
 
 
+def two_in_one(file):
+    file['episode_1/truncations'] = [False, True, False, False, True]
+
+
+def text_as_mark(file):
+    file['episode_1/dones'] = 'yes'
+
+
 @pytest.mark.parametrize(
     ('oddity', 'message'),
     [
@@ -270,6 +278,8 @@ def far_number(file):
         (far_number, 'episode 2 is missing of 1000000000001'),
         (bomb, 'episode_1/actions announces 16000000000000 bytes, more than can be in the 0'),
         (unwritten, 'episode_1/actions announces 80 bytes, more than can be in the 0 stored'),
+        (two_in_one, 'episode_1 ends after transition 1 by its truncations, but has 5'),
+        (text_as_mark, 'episode_1/dones must be a flag for each step'),
         (large_chunks, 'episode_1/actions holds 80 bytes in chunks of 134217728'),
     ],
 )
@@ -313,6 +323,9 @@ def test_d4rl_file_ends_trajectories_by_terminals_and_timeouts(tmp_path):
         ({'timeouts': np.zeros(8, bool)}, 'timeouts must have a value for each row'),
         ({'timeouts': np.full(9, 2)}, 'timeouts must hold 0 or 1'),
         ({'is_last': np.zeros(9, bool)}, 'is_last looks like a mark of trajectories'),
+        ({'infos/episode_id': np.zeros(9)}, 'episode_id looks like a mark of trajectories'),
+        ({'infos/run': np.arange(9) // 6}, 'run looks like a mark of trajectories'),
+        ({'next_obs': np.ones((9, 4))}, 'next_obs of row 0 is not observation 1'),
         ({'actions': np.zeros((8, 2))}, 'actions has 8 rows but observations has 9'),
         ({'actions': np.zeros(9)}, 'actions must be numbers of shape'),
     ],

@@ -147,8 +147,13 @@ def test_data_outside_the_scaling_are_refused(dataset, message):
 @pytest.mark.parametrize(
     ('change', 'message'),
     [
-        ({'std': [1.0, 0.0]}, 'std must be above 0'),
-        ({'mean': [1.0]}, 'mean must be 2 finite numbers'),
+        ({'std': [1.0, 0.0]}, 'std must be at least 1e-15'),
+        ({'std': [1.0, 1e-320]}, 'std must be at least 1e-15'),
+        ({'mean': [1.0]}, 'mean must be 2 numbers'),
+        ({'origin': [0.0, -1e308]}, r'origin must be 2 numbers within 1e\+15'),
+        ({'limit': [1.0, 1e300]}, r'limit must be 2 numbers within 1e\+15'),
+        ({'std': [1.0, 10**400]}, r'std must be 2 numbers \(int too large'),
+        ({'mean': ['a', 0.0]}, r'mean must be 2 numbers \(could not'),
         ({'other': [1.0]}, 'scaling needs origin, mean, std, limit'),
     ],
 )
@@ -168,6 +173,8 @@ def test_contract_travels_with_the_dataset(tmp_path):
     )
     data.save(tmp_path / 'robot.npz')
     assert TrajectoryDataset.load(tmp_path / 'robot.npz').contract == contract
+    marks = [TrajectoryDataset.load(tmp_path / f'{name}.npz') for name in ('plain', 'robot')]
+    assert marks[0].fingerprint != marks[1].fingerprint == data.fingerprint
 
 
 @pytest.mark.parametrize('text', ['[1]', '{', np.zeros(2)])

@@ -95,7 +95,15 @@ def test_contract_about_nothing_is_refused(tmp_path: Path):
 
 @pytest.mark.parametrize(
     ('content', 'message'),
-    [(None, 'cannot be read'), ('- 1', 'a mapping'), ('', 'a mapping'), ('a: !x 1', 'not valid')],
+    [
+        (None, 'cannot be read'),
+        ('- 1', 'a mapping'),
+        ('', 'a mapping'),
+        ('a: !x 1', 'not valid'),
+        (f'a: [{"1," * 70000}]', 'is no file of settings, it has over 131072 bytes'),
+        (f'rate_hz: {"59:" * 3000}1', 'rate_hz: .*, got a number of thousands of digits'),
+        (f'rate_hz: {"x" * 1000}', r'rate_hz: .*, got .x{199}\.{3}\n'),
+    ],
 )
 def test_files_that_hold_no_contract_are_refused(tmp_path: Path, content, message):
     file = tmp_path / 'robot.yaml'

@@ -10,7 +10,6 @@ from typing import Any
 
 from metagcttt_core import CheckpointError, files, load_checkpoint, save_checkpoint
 from metagcttt_core.agents import AGENTS
-from metagcttt_core.training import checkpoint
 from metagcttt_core.training.checkpoint import has_checkpoint, load_training_state, TrainingState
 from metagcttt_core.training.optimizers import pretrained_state
 import pytest
@@ -250,6 +249,7 @@ def test_other_version_is_refused_by_number(version, tmp_path):
         ({'weights': '../../elsewhere.safetensors'}, 'weights: String should match pattern'),
         ({'weights': '/etc/passwd'}, 'weights: String should match pattern'),
         ({'metadata': 3}, 'metadata: Input should be a valid dictionary'),
+        ({'metadata': {'contract': 5}}, 'contract: Input should be a valid dictionary'),
         ({'extra': 1}, "no setting 'extra'"),
         ({'training': {'stage': 'x', 'step': -1, 'settings': {}}}, 'training.step: .*got -1'),
     ],
@@ -348,8 +348,9 @@ def test_weights_that_are_no_safetensors_are_refused(content, tmp_path):
             lambda t: t.update({'agent.actor.mean.bias': torch.zeros(2, dtype=torch.float64)}),
             'weight actor.mean.bias is torch.float64, expected torch.float32',
         ),
+        (lambda t: t.update({'actor.mean.bias': torch.zeros(2)}), 'unknown tensor actor.mean'),
     ],
-    ids=['missing', 'extra', 'shape', 'nan', 'inf', 'dtype'],
+    ids=['missing', 'extra', 'shape', 'nan', 'inf', 'dtype', 'name'],
 )
 def test_weights_that_do_not_fit_are_refused_by_name(change, message, tmp_path):
     saved_agent(tmp_path)
@@ -367,14 +368,27 @@ def test_weights_that_do_not_fit_are_refused_by_name(change, message, tmp_path):
             lambda t: t['optimizer.3.exp_avg'].fill_(float('nan')),
             'optimizer.3.exp_avg holds a non-',
         ),
+        (
+            lambda t: t.update({'optimizer.0.step': torch.zeros(()).to(torch.float8_e4m3fn)}),
+            'optimizer.0.step is torch.float8_e4m3fn, expected torch.float32',
+        ),
+        (
+            lambda t: t.update({'optimizer.3.exp_avg_sq': -torch.ones(2)}),
+            'optimizer.3.exp_avg_sq holds a negative value',
+        ),
+        (
+            lambda t: t.update({f'optimizer.{"9" * 30}.step': torch.zeros(())}),
+            'unknown tensor optimizer.9',
+        ),
     ],
-    ids=['name', 'group', 'nan'],
+    ids=['name', 'group', 'nan', 'dtype', 'negative', 'number'],
 )
 def test_wrong_optimizer_state_is_refused_by_name(change, message, tmp_path):
     saved_agent(tmp_path, training=training_state())
     change_weights(tmp_path, change)
-    with pytest.raises(CheckpointError, match=message):
-        load_training_state(tmp_path)
+    for load in (load_training_state, load_checkpoint):
+        with pytest.raises(CheckpointError, match=message):
+            load(tmp_path)
 
 
 def test_non_finite_agent_is_not_saved_over_a_good_checkpoint(tmp_path):
@@ -403,7 +417,7 @@ class Crash(BaseException):
 @pytest.mark.parametrize('moment', ['before', 'during'])
 def test_crash_while_saving_leaves_the_old_checkpoint(completed, moment, tmp_path, monkeypatch):
     old = saved_agent(tmp_path, seed=1, training=training_state(step=5))
-    writes, atomic_write = [], checkpoint.atomic_write
+    writes, atomic_write = [], files.atomic_write
 
     class Dying:
         def __init__(self, file):
@@ -421,8 +435,7 @@ def test_crash_while_saving_leaves_the_old_checkpoint(completed, moment, tmp_pat
         with atomic_write(path) as file:
             yield file if len(writes) <= completed else Dying(file)
 
-    for module in (checkpoint, files):
-        monkeypatch.setattr(module, 'atomic_write', dying_write)
+    monkeypatch.setattr(files, 'atomic_write', dying_write)
     with pytest.raises(Crash):
         saved_agent(tmp_path, seed=2, training=training_state(step=6))
     assert len(writes) == completed + 1
@@ -438,7 +451,7 @@ def test_crash_before_the_first_checkpoint_leaves_none(tmp_path, monkeypatch):
     def die(*args, **kwargs):
         raise Crash
 
-    monkeypatch.setattr(checkpoint, 'write_json', die)
+    monkeypatch.setattr(files, 'write_json', die)
     with pytest.raises(Crash):
         saved_agent(tmp_path)
     assert not has_checkpoint(tmp_path)

@@ -1,7 +1,7 @@
 """TrainingRun: when it saves, when it stops, and what it refuses to go on with."""
 
-from metagcttt_core import CheckpointError
-from metagcttt_core.training.checkpoint import has_checkpoint, load_training_state
+from metagcttt_core import CheckpointError, save_checkpoint
+from metagcttt_core.training.checkpoint import has_checkpoint, load_training_state, TrainingState
 from metagcttt_core.training.optimizers import make_optimizer
 from metagcttt_core.training.run import TrainingInterrupted, TrainingRun
 import pytest
@@ -127,6 +127,15 @@ def test_resume_refuses_an_agent_of_another_shape_by_name(tmp_path):
     TrainingRun('pretrain', {}, tmp_path).step_done(small, None, 1, 1)
     with pytest.raises(CheckpointError, match='cannot resume, settings of the agent was'):
         TrainingRun('pretrain', {}, tmp_path, resume=True).restore(large, None)
+
+
+def test_resume_refuses_moments_of_another_shape_by_name(tmp_path):
+    agent, optimizer = trained()
+    state = optimizer.state_dict()['state']
+    state[3]['exp_avg'] = torch.zeros(1)  # kernels in C would read beyond its end
+    save_checkpoint(agent, tmp_path, TrainingState('pretrain', 5, SETTINGS, state))
+    with pytest.raises(CheckpointError, match=r'cannot resume, optimiser state of parameter 3'):
+        TrainingRun('pretrain', SETTINGS, tmp_path, resume=True).restore(agent, optimizer)
 
 
 def test_process_that_does_not_write_restores_and_stops_all_the_same(tmp_path):

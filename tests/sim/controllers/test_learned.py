@@ -50,7 +50,7 @@ def test_new_controller_takes_the_place_of_the_old_one_and_leaves_nothing_else(
 ) -> None:
     follower(0).save(tmp_path)
     with monkeypatch.context() as patch:
-        patch.setattr('sim_bridge.controllers.learned.write_json', interrupt)
+        patch.setattr('metagcttt_core.files.write_json', interrupt)
         with pytest.raises(KeyboardInterrupt):
             follower(1).save(tmp_path)
     assert LearnedFollower.load(tmp_path).sha256 == follower(0).sha256

@@ -10,6 +10,7 @@ import sys
 import time
 
 from metagcttt_core.data import TrajectoryDataset
+from metagcttt_core.files import claim_folder
 import numpy as np
 from ogbench.utils import load_dataset
 import pytest
@@ -210,6 +211,13 @@ def test_finished_dataset_is_refused_or_left_as_it_is(tmp_path: Path) -> None:
         generate(small(seed=1), output, resume=True)
     assert generate(small(), output, resume=True) == statistics
     assert contents(tmp_path) == before
+
+
+def test_folder_without_settings_is_begun_anew(tmp_path: Path) -> None:
+    claim_folder(tmp_path / 'maze.partial')  # the disk was full when they were to be written
+    generate(small(3), tmp_path / 'maze.npz')
+    assert not (tmp_path / 'maze.partial').exists()
+    assert (tmp_path / 'maze.npz').exists()
 
 
 def test_foreign_sidecar_is_refused(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """CSV and parquet files become datasets by a column map; what does not fit is named."""
 
+import os
 from pathlib import Path
 
 from metagcttt_core import TrajectoryDataset
@@ -122,6 +123,7 @@ def test_lists_times_of_any_unit_and_limits_of_the_data(tmp_path, capsys):
         ({'run': [1, 1, 2, None, 3, 3, 3]}, 'run has no value in row 3'),
         ({'t': [0.0, 0.2, 0.1, 0.3, 4, 5, 6]}, 'the time is 0.1 s in row 2, after 0.2 s'),
         ({'t': [0.0, float('nan'), 0.1, 0.3, 4, 5, 6]}, 't is nan in row 1'),
+        ({'x': [[]] * 7}, 'x has no values, its lists are empty'),
         ({'run': list(range(7))}, 'no transitions, every trajectory is a single row'),
     ],
 )
@@ -176,6 +178,23 @@ def test_damage_to_parquet_is_named(tmp_path, capsys):
     assert 'run git lfs pull' in complaint(capsys, tmp_path, file)
     file.write_bytes(whole[:4] + b'\xff' * (len(whole) - 12) + whole[-8:])
     assert f'{file}: is no parquet file, or damaged' in complaint(capsys, tmp_path, file)
+
+
+@pytest.mark.parametrize('suffix', ['.csv', '.parquet'])
+def test_column_that_is_there_twice_is_named(tmp_path, capsys, suffix):
+    content = table()
+    twice = content.append_column('x', content['y'])
+    file = write(tmp_path, twice, suffix)
+    assert f"{file}: has several columns named 'x'" in complaint(capsys, tmp_path, file)
+
+
+def test_few_bytes_that_announce_more_than_memory_are_refused(tmp_path, capsys, monkeypatch):
+    file = write(tmp_path, pa.table({name: [0.0] * 10**5 for name in 'txyvw'}), '.parquet')
+    assert file.stat().st_size < 10_000
+    monkeypatch.setattr(os, 'sysconf', lambda _: 1000)  # a machine of a megabyte
+    columns = MAP.replace('episode: run', 'file: true')
+    error = complaint(capsys, tmp_path, file, columns=columns)
+    assert f'{file} takes 12000000 bytes of memory, this machine has 1000000' in error
 
 
 def test_existing_dataset_stays(tmp_path, capsys):

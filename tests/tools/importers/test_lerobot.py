@@ -3,6 +3,7 @@
 from collections.abc import Callable
 import json
 from pathlib import Path
+import resource
 import shutil
 from typing import Any
 
@@ -168,6 +169,8 @@ class TestImport:
             ({'codebase_version': 'v2.1'}, 'convert_dataset_v21_to_v30'),
             ({'codebase_version': None}, 'codebase_version is None, not v3'),
             ({'fps': 0}, 'fps: Input should be greater than 0, got 0'),
+            ({'fps': float('inf')}, 'fps: Input should be a finite number, got inf'),
+            ({'data_path': 'a\0b'}, 'data_path leads out of the folder'),
             ({'total_frames': 20}, 'counts 3 episodes and 20 frames; there are 3 and 21'),
             ({'data_path': '../{chunk_index}'}, 'data_path leads out of the folder'),
             ({'data_path': '{episode_chunk}'}, 'takes more than chunk_index and file_index'),
@@ -177,6 +180,17 @@ class TestImport:
     def test_wrong_info_is_named(self, pusht, capsys, changes, error):
         change_info(pusht, **changes)
         assert error in complaint(capsys, pusht)
+
+    def test_rows_of_other_lengths_than_announced_are_named(self, pusht, capsys):
+        features = json.loads((pusht / 'meta' / 'info.json').read_text())['features']
+        for shape, error in (
+            ([10**12], 'action has 2 values in a row, but shape (1000000000000,) by meta/info'),
+            ([-2], 'features.action.shape.0: Input should be greater than or equal to 0, got -2'),
+        ):
+            change_info(
+                pusht, features={**features, 'action': {**features['action'], 'shape': shape}}
+            )
+            assert error in complaint(capsys, pusht)
 
     def test_what_is_no_dataset_is_named(self, pusht, capsys):
         (pusht / 'meta' / 'info.json').write_text('{')
@@ -264,6 +278,19 @@ class TestExport:
         again = convert(folder, '--contract', str(tmp_path / 'cart.yaml'))
         np.testing.assert_array_equal(again.observations, dataset.observations)
         np.testing.assert_allclose(again.actions, dataset.actions, atol=1e-6)
+
+    def test_full_disk_is_named_and_nothing_is_left(self, tmp_path, capsys):
+        data, out = tmp_path / 'data.npz', tmp_path / 'out'
+        random_dataset().save(data)
+        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (500, limits[1]))
+        try:
+            with pytest.raises(SystemExit, match='2'):
+                main(['export-lerobot', str(data), '--fps', '10', '--out', str(out)])
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert '.parquet: file too large' in capsys.readouterr().err
+        assert {path.name for path in tmp_path.iterdir()} == {'data.npz', '.out.lock'}
 
     def test_what_cannot_be_written_is_named(self, tmp_path, capsys):
         with pytest.raises(SystemExit, match='2'):

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from metagcttt_core.data import DatasetError
+from metagcttt_core.data.bounds import check_memory
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -11,6 +12,8 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 
 _POINTER = b'version https://git-lfs'
+_BYTES = 8  # of a number
+_COPIES = 3  # the table, its numbers, and the rows made of them
 
 
 def read_parquet(path: Path, columns: Iterable[str] | None = None) -> pa.Table:
@@ -23,6 +26,7 @@ def read_parquet(path: Path, columns: Iterable[str] | None = None) -> pa.Table:
         # `partitioning` would make columns of folder names.
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             names = _checked(path, file.schema_arrow.names, columns)
+            check_memory(_COPIES * _values(file.metadata, names) * _BYTES, str(path))
             return file.read(columns=names)
     except FileNotFoundError as error:
         raise DatasetError(f'{path}: no such file') from error
@@ -71,6 +75,8 @@ def numbers(table: pa.Table, name: str, where: str) -> np.ndarray:
                 'first'
             )
         width = lengths[0].as_py() if len(lengths) else 1
+        if not width:
+            raise DatasetError(f'{where}: {name} has no values, its lists are empty')
         column = column.flatten()
         if column.null_count:
             row = pc.index(pc.is_null(column), True).as_py() // width
@@ -85,12 +91,24 @@ def numbers(table: pa.Table, name: str, where: str) -> np.ndarray:
 
 def _checked(path: Path, found: list[str], wanted: Iterable[str] | None) -> list[str]:
     names = list(dict.fromkeys(found if wanted is None else wanted))
+    if repeated := [name for name in names if found.count(name) > 1]:
+        raise DatasetError(f'{path}: has several columns named {repeated[0]!r}')
     if missing := [name for name in names if name not in found]:
         raise DatasetError(
             f'{path}: has no column {", ".join(map(repr, missing))} (there are: '
             f'{", ".join(map(repr, found))})'
         )
     return names
+
+
+def _values(metadata: pq.FileMetaData, names: Iterable[str]) -> int:
+    """Numbers in some columns, which a few bytes may repeat a billion times."""
+    wanted = set(names)
+    groups = (metadata.row_group(number) for number in range(metadata.num_row_groups))
+    chunks = (group.column(number) for group in groups for number in range(group.num_columns))
+    return sum(
+        chunk.num_values for chunk in chunks if chunk.path_in_schema.split('.')[0] in wanted
+    )
 
 
 def _fault_of_parquet(path: Path, error: BaseException) -> str:

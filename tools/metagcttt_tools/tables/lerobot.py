@@ -36,7 +36,7 @@ class Feature(BaseModel):
     """A column, as info.json describes it."""
 
     dtype: str
-    shape: tuple[int, ...]
+    shape: tuple[Annotated[int, Field(ge=0)], ...]
     names: Any = None
 
     @property
@@ -53,7 +53,7 @@ class Info(BaseModel):
     """What meta/info.json has to say; other keys are not looked at."""
 
     codebase_version: str
-    fps: Annotated[float, Field(gt=0)]
+    fps: Annotated[float, Field(gt=0, allow_inf_nan=False)]
     total_episodes: Annotated[int, Field(ge=0)]
     total_frames: Annotated[int, Field(ge=0)]
     data_path: str
@@ -108,6 +108,8 @@ def read_lerobot(
         if not len(table):
             raise DatasetError(f'{path}: has no rows')
         inside = [episode for episode in episodes if episode.file == file]
+        for name in features:
+            _compare_width(table, name, info.features[name], path)
         if not trust_rows:
             _compare(table, inside, path, index)
         parts.append(_rows(table, columns, names, info, path))
@@ -184,7 +186,7 @@ def _data_file(folder: Path, info: Info, chunk: int, file: int) -> PurePosixPath
             'and file_index, of at most 99 digits'
         )
     path = PurePosixPath(info.data_path.format(chunk_index=chunk, file_index=file))
-    if path.is_absolute() or '..' in path.parts:
+    if path.is_absolute() or '..' in path.parts or '\0' in str(path):
         raise DatasetError(f'{folder}: meta/info.json: data_path leads out of the folder: {path}')
     return path
 
@@ -210,6 +212,16 @@ def _rows(
 
 def _counts(table: pa.Table, name: str, path: Path) -> NDArray[np.int64]:
     return numbers(table, name, str(path))[:, 0].astype(np.int64)
+
+
+def _compare_width(table: pa.Table, name: str, feature: Feature, path: Path) -> None:
+    """Refuse rows of other lengths than meta/info.json announces."""
+    width = numbers(table, name, str(path)).shape[1]
+    if (width,) != feature.shape:
+        raise DatasetError(
+            f'{path}: {name} has {width} values in a row, but shape {feature.shape} by '
+            'meta/info.json'
+        )
 
 
 def _compare(table: pa.Table, episodes: list[_Episode], path: Path, first: int) -> None:

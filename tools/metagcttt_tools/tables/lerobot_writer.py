@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from metagcttt_core import TrajectoryDataset
-from metagcttt_core.files import write_json
+from metagcttt_core.files import atomic_write, write_json
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -169,5 +169,5 @@ def _tasks(task: str) -> pa.Table:
 
 
 def _write(path: Path, table: pa.Table) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(table, path, compression='snappy', write_page_checksum=True)
+    with atomic_write(path) as file:
+        pq.write_table(table, file, compression='snappy', write_page_checksum=True)

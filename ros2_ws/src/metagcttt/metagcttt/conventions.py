@@ -5,8 +5,10 @@ from contextlib import contextmanager
 import copy
 from functools import wraps
 import math
+import re
 from typing import Any
 
+from metagcttt_core.config.settings import nearest_name
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
@@ -27,6 +29,7 @@ OVERRIDDEN = (
 )
 OF_ROS = ('/parameter_events', '/rosout')
 TYPES_PERIOD_S = 1.0
+_OVERRIDE_OF_TOPIC = re.compile(r'qos_overrides\.([^.]+)\.')
 MAX_NAME = 255  # characters in the name of a frame
 
 
@@ -35,6 +38,8 @@ class ConventionalNode(Node):
 
     - `ros2 param load` of its own `ros2 param dump` works: a parameter may be set to the value it
       has, also when it is read-only.
+    - A parameter given at the start that it does not have, such as a misspelt one, is named in a
+      warning.
     - The quality of service of its topics can be changed at the start, by the parameters
       `qos_overrides.TOPIC.publisher.reliability` and their kin.
     - Where it and another node cannot hear one another, because of a quality of service or because
@@ -47,7 +52,7 @@ class ConventionalNode(Node):
         self._types: dict[str, str] = {}  # of our topics
         self._told: set[tuple[str, ...]] = set()
         super().__init__(*args, **kwargs)
-        self.create_timer(TYPES_PERIOD_S, self._compare_types, clock=STEADY)
+        self.create_timer(TYPES_PERIOD_S, self._look_around, clock=STEADY)
 
     # --- parameters --------------------------------------------------------------------------
 
@@ -81,6 +86,18 @@ class ConventionalNode(Node):
             return False
         own = self.get_parameter(parameter.name)
         return (own.type_, own.value) == (parameter.type_, parameter.value)
+
+    def _name_unknown_parameters(self) -> None:
+        own = self.get_parameters_by_prefix('')
+        for name in sorted(self._parameter_overrides.keys() - own.keys()):
+            topic = _OVERRIDE_OF_TOPIC.match(name)
+            later = topic and topic[1] not in self._types  # it may be created yet
+            if ('parameter', name) in self._told or later:
+                continue
+            self._told.add(('parameter', name))
+            near = nearest_name(name, own)
+            hint = f'; did you mean {near}?' if near else ''
+            self.get_logger().warning(f'there is no parameter {name}, it is ignored{hint}')
 
     # --- topics ------------------------------------------------------------------------------
 
@@ -172,6 +189,10 @@ class ConventionalNode(Node):
             f'{topic}: {word} does not fit, no messages pass: this {own} {verbs[0]} '
             f'{_value(ours, word)}, {who}; qos_overrides.{topic}.{own}.{word} changes ours'
         )
+
+    def _look_around(self) -> None:
+        self._name_unknown_parameters()
+        self._compare_types()
 
     def _compare_types(self) -> None:
         for topic, types in self.get_topic_names_and_types():

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-import hashlib
 from typing import Any, Protocol
 
 from metagcttt_core import (
@@ -54,16 +53,8 @@ class Deployment:
     @cached_property
     def identity(self) -> Identity:
         """Its identity; reads all weights and rows the first time."""
-        agent = self.agent
-        digest = hashlib.blake2b(digest_size=8)
-        digest.update(f'{agent.name} {agent.settings.model_dump_json()}'.encode())
-        digest.update(agent.fingerprint().encode())
-        for number, state in (agent.optimizer_state or {}).items():
-            for name, values in state.items():
-                digest.update(f'{number}.{name}{tuple(values.shape)}'.encode())
-                digest.update(values.cpu().numpy().tobytes())
         return Identity(
-            checkpoint=digest.hexdigest(),
+            checkpoint=self.agent.fingerprint(),
             dataset=self.dataset.fingerprint,
             filter=self.trajectory_filter.config.model_dump_json(),
         )
