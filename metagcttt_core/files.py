@@ -11,9 +11,11 @@ import hashlib
 import json
 import os
 from pathlib import Path
+import platform
 import re
 import shutil
 import tempfile
+import time
 from typing import Any, IO, TypeVar
 
 PICTURE_MARK = 'metagcttt'
@@ -24,6 +26,8 @@ WEIGHTS = r'weights-[0-9a-f]{16}\.safetensors'
 
 _T = TypeVar('_T')
 _MARK = '.made-by-metagcttt'
+_LOG_MARK = re.compile(rb'# \d{4}-\d\d-\d\d \d\d:\d\d:\d\d on .*: metagcttt ')
+_LONGEST_MARK = 500
 _PICTURES = ('.png', '.gif')
 _PROVENANCE = {'commit', 'versions'}
 
@@ -165,6 +169,33 @@ def read_with_weights(
         except FileNotFoundError:
             if weights(read_index()) == weights(index):
                 raise
+
+
+def open_log(path: Path, program: str, *, anew: bool = False) -> IO[bytes]:
+    """A log of a program, begun by a line with time, machine and program, which is its mark.
+
+    Args:
+        path: The log; missing folders are created.
+        program: The program and its arguments.
+        anew: Whether what an earlier run left is removed first; else it is added to.
+
+    Raises:
+        FileExistsError: If there is a file that is no log of ours, or a symbolic link.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.is_symlink():
+        raise FileExistsError(f'{path} is a symbolic link: move it elsewhere')
+    log = open(path, 'a+b', buffering=0, opener=not_through_links)
+    log.seek(0)
+    first = log.read(_LONGEST_MARK)
+    if first and not _LOG_MARK.match(first):
+        log.close()
+        raise FileExistsError(f'{path} exists and was not made by metagcttt: move it elsewhere')
+    if anew:
+        log.truncate(0)
+    now = time.strftime('%Y-%m-%d %H:%M:%S')
+    log.write(f'# {now} on {platform.node()}: metagcttt {program}\n'.encode())
+    return log
 
 
 def refuse_foreign(record: Path, *others: Path) -> None:

@@ -8,6 +8,7 @@ from metagcttt_core.files import (
     atomic_write,
     claim_folder,
     not_through_links,
+    open_log,
     PICTURE_MARK,
     read_with_weights,
     refuse_foreign,
@@ -180,3 +181,22 @@ def test_weights_are_those_of_the_index_while_another_pair_takes_its_place(tmp_p
     assert read_with_weights(lambda: next(indices), tmp_path.joinpath) == ('new', b'new')
     with pytest.raises(FileNotFoundError, match='old'):
         read_with_weights(lambda: 'old', tmp_path.joinpath)
+
+
+@pytest.mark.parametrize('anew', [False, True])
+def test_log_is_opened_again_but_no_file_of_somebody_else(anew, tmp_path):
+    log, link = tmp_path / 'logs' / 'node.log', tmp_path / 'link.log'
+    for line in (b'first\n', b'second\n'):
+        with open_log(log, 'goal_node', anew=anew) as file:
+            file.write(line)
+    text = log.read_text()
+    assert text.startswith('# ')
+    assert text.count(': metagcttt goal_node\n') == (1 if anew else 2)
+    assert ('first\n' in text, text.endswith('second\n')) == (not anew, True)
+    link.symlink_to(log)
+    with pytest.raises(FileExistsError, match=r'link\.log is a symbolic link'):
+        open_log(link, 'goal_node', anew=anew)
+    log.write_text('# Four years of work')
+    with pytest.raises(FileExistsError, match=r'node\.log exists and was not made by metagcttt'):
+        open_log(log, 'goal_node', anew=anew)
+    assert log.read_text() == '# Four years of work'

@@ -228,6 +228,10 @@ def test_results_of_other_policies_are_put_aside_and_evaluated_anew(preset, monk
         assert evaluation.out.exists() != left
     outdated = evaluation.out.with_name('evaluation-full.outdated.json')
     assert json.loads(outdated.read_text()) == report
+    evaluation.out.write_text(json.dumps(report))
+    assert evaluation in study._to_evaluate()
+    assert outdated.with_name('evaluation-full.outdated-2.json').exists()
+    assert outdated.exists()
 
 
 def test_a_run_that_fails_ends_the_study_with_its_message(preset, capsys):

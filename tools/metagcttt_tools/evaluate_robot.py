@@ -10,14 +10,15 @@ from typing import Annotated, Any, TYPE_CHECKING, TypeVar
 from metagcttt_core import success_statistics
 from metagcttt_core.config import Settings
 from metagcttt_core.config.yaml_file import load_yaml
-from metagcttt_core.files import refuse_foreign, write_json
-from metagcttt_core.robot import load_contract
+from metagcttt_core.files import write_json
+from metagcttt_core.robot import Contract, load_contract
 import numpy as np
 from pydantic import Field, model_validator
 
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.results import markdown_table
-from metagcttt_tools.common.session import provenance
+from metagcttt_tools.common.session import provenance, sole_writer
+from metagcttt_tools.evaluate import check_fingerprints, fingerprints
 
 if TYPE_CHECKING:
     from metagcttt_tools.graph.robot import RobotOutcome
@@ -124,14 +125,30 @@ def main(argv: list[str] | None = None) -> None:
         for budget in settings.budgets
         for seed in settings.seeds
     }
+    policies = sorted({path for path, _ in arms.values()})
     try:
-        refuse_foreign(settings.out)
-        outcomes = drive_robot(settings, arms, settings.out.parent / 'logs')
+        robot_of(settings)  # before anything is written
+        with sole_writer(settings.out, settings.out):
+            marks = fingerprints(settings.dataset, policies)
+            outcomes = drive_robot(settings, arms, settings.out.parent / 'logs')
+            now = fingerprints(settings.dataset, policies)
+            check_fingerprints(policies[0], {'fingerprints': marks}, now)
+            results = _results(settings, outcomes)
+            report = {'settings': settings.model_dump(mode='json'), **provenance()}
+            write_json(settings.out, {**report, 'fingerprints': marks, 'results': results})
     except (NodeFailedError, NoAnswerError, ValueError, FileExistsError) as error:
         fail(*str(error).splitlines())
     except KeyboardInterrupt:
         raise SystemExit(130) from None
-    results = [
+    print(format_table(results))
+    print(f'results: {settings.out}')
+
+
+def _results(
+    settings: EvaluateRobotSettings,
+    outcomes: Mapping[tuple[str, int, int], list[RobotOutcome]],
+) -> list[dict[str, Any]]:
+    return [
         {
             'checkpoint': checkpoint,
             'budget': budget,
@@ -143,10 +160,20 @@ def main(argv: list[str] | None = None) -> None:
         for checkpoint in settings.checkpoints
         for budget in settings.budgets
     ]
-    report = {'settings': settings.model_dump(mode='json'), **provenance(), 'results': results}
-    write_json(settings.out, report)
-    print(format_table(results))
-    print(f'results: {settings.out}')
+
+
+def robot_of(settings: GraphSettings) -> tuple[Contract, RobotTasks]:
+    """The contract of a simulated robot, and its tasks.
+
+    Raises:
+        ValueError: If one is wrong, or the robot is none that is simulated.
+    """
+    contract = load_contract(settings.contract)
+    if contract.robot not in ROBOTS:
+        raise ValueError(
+            f'{settings.contract}: {contract.robot} is not simulated, {", ".join(ROBOTS)} are'
+        )
+    return contract, load_yaml(settings.tasks, RobotTasks)
 
 
 def drive_robot(
@@ -168,12 +195,7 @@ def drive_robot(
     from metagcttt_tools.graph.drive import drive_policies, Executable
     from metagcttt_tools.graph.robot import RobotClient
 
-    contract = load_contract(settings.contract)
-    if contract.robot not in ROBOTS:
-        raise ValueError(
-            f'{settings.contract}: {contract.robot} is not simulated, {", ".join(ROBOTS)} are'
-        )
-    tasks = load_yaml(settings.tasks, RobotTasks)
+    contract, tasks = robot_of(settings)
     clock = {'use_sim_time': True}
     files = {'contract': str(settings.contract)}
     dataset = {'dataset': str(settings.dataset)}

@@ -3,8 +3,9 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from itertools import chain
+from itertools import chain, count
 import math
+import os
 from pathlib import Path
 import sys
 from typing import Annotated, Any
@@ -115,7 +116,7 @@ def main(argv: list[str] | None = None) -> None:
             use_threads(1)
             print(study.estimate())
             return
-        with sole_writer(settings.out, settings.out / FILE):
+        with sole_writer(settings.out, settings.out / FILE, *study.files):
             study.run()
     except ValueError as error:
         fail(str(error))
@@ -189,6 +190,14 @@ class Study:
                     f'({", ".join(map(str, budgets))})'
                 )
 
+    @property
+    def files(self) -> list[Path]:
+        """What is written into its folder besides the manifest and folders of runs."""
+        planned = [*self.evaluations.values(), *([self.curve] if self.curve else [])]
+        evaluations = [run for run, _ in planned]
+        runs = [*self.pretraining, *(run for _, run in self.post_training), *evaluations]
+        return [*map(_preset_of, runs), *(run.out for run in evaluations)]
+
     def run(self) -> None:
         """Run whatever is not done yet."""
         out = self.settings.out
@@ -234,7 +243,7 @@ class Study:
         runs = self._not_evaluated()
         for run in runs:
             if run.out.exists() and not finished_jobs(run.out).exists():
-                run.out.replace(run.out.with_suffix('.outdated.json'))
+                run.out.replace(_free_name(run.out.with_suffix('.outdated.json')))
         return runs
 
     def manifest(self) -> Manifest:
@@ -302,6 +311,18 @@ class Study:
             return EvaluateSettings.model_validate(values), policies
 
 
+def _free_name(path: Path) -> Path:
+    """The path, or one with a number where there is a file already."""
+    names = (path.with_stem(f'{path.stem}-{number}') for number in count(2))
+    return next(each for each in chain([path], names) if not os.path.lexists(each))
+
+
+def _preset_of(run: Any) -> Path:
+    """The file of settings beside the results of a run."""
+    out: Path = run.out
+    return out.with_name(f'{out.name.removesuffix(".json")}.yaml')
+
+
 @contextmanager
 def _named(part: str) -> Iterator[None]:
     """Says in errors which part of a study has the wrong settings."""
@@ -316,7 +337,7 @@ def _jobs(tool: str, runs: Sequence[Any]) -> list[Job]:
     """One tool with each of the settings, kept as YAML beside the results."""
     jobs = []
     for run in runs:
-        preset = run.out.with_name(f'{run.out.name.removesuffix(".json")}.yaml')
+        preset = _preset_of(run)
         write_text(preset, yaml.safe_dump({tool: run.model_dump(mode='json')}, sort_keys=False))
         invocation = Invocation(tool.replace('_', '-'), preset, run.out, Path.cwd())
         if isinstance(run, EvaluateSettings):

@@ -50,6 +50,8 @@ PROGRAMS: list[tuple[Callable[[list[str]], None], str, str]] = [
     (inspect_data.main, 'DATA --out DIR/run.png', 'run.png'),
     (top_view.main, '--recording DIR/x.mcap --out DIR/run.gif', 'run.gif'),
     (sweep.main, '--preset quick --out DIR', 'manifest.json'),
+    (sweep.main, '--preset quick --out DIR', 'base-0.yaml'),
+    (sweep.main, '--preset quick --out DIR', 'evaluation-ttt.json'),
     (generate.main, '--output DIR/maze.npz', 'maze.png'),
     (generate.main, '--output DIR/maze.npz', 'maze.npz'),
     (generate.main, '--output DIR/maze.npz --resume', 'maze.npz'),

@@ -7,7 +7,7 @@ import signal
 import subprocess
 from typing import Self
 
-from metagcttt_core.files import not_through_links
+from metagcttt_core.files import open_log
 
 _ROS2RUN = Path(__file__).parents[2] / 'ros2run'
 # Also when the owner is killed.
@@ -40,6 +40,9 @@ class NodeProcess:
             environment: Environment variables besides those of this process.
             remappings: Names to replace, such as `/clock`; `__ns` sets the namespace.
             package: The ROS package that has it.
+
+        Raises:
+            FileExistsError: If there is a file in the place of the log that is none of ours.
         """
         self.executable = executable
         self.log = log
@@ -49,8 +52,7 @@ class NodeProcess:
             command += ['-p', f'{name}:={text}']
         for name, other in (remappings or {}).items():
             command += ['-r', f'{name}:={other}']
-        log.parent.mkdir(parents=True, exist_ok=True)
-        with open(log, 'wb', opener=not_through_links) as output:
+        with open_log(log, executable, anew=True) as output:
             self._process = subprocess.Popen(
                 command,
                 stdout=output,

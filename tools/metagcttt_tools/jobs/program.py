@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from pathlib import Path
-import platform
 import shutil
 import signal
 import subprocess
@@ -11,7 +10,7 @@ import time
 from typing import NamedTuple
 
 from filelock import FileLock, Timeout
-from metagcttt_core.files import not_through_links
+from metagcttt_core.files import open_log
 
 from metagcttt_tools.common.session import lock_of
 from metagcttt_tools.common.stopping import REQUEUE
@@ -85,10 +84,11 @@ def run_program(job: Invocation, stopped: Callable[[], bool] = lambda: False) ->
         raise JobError(f'{lock}: is held by another process for {_LOCK_TIMEOUT_S:g} s') from error
     # The kernel sends the signal; a process that nobody waits for must not train on.
     leash = ['setpriv', '--pdeathsig', 'TERM', '--'] if shutil.which('setpriv') else []
-    with open(job.log, 'a', encoding='utf-8', opener=not_through_links) as log:
-        began = time.strftime('%Y-%m-%d %H:%M:%S')
-        log.write(f'{ATTEMPT} {began} on {platform.node()}: metagcttt {job.program}\n')
-        log.flush()
+    try:
+        log = open_log(job.log, job.program)
+    except FileExistsError as error:
+        raise JobError(str(error)) from error
+    with log:
         process = subprocess.Popen(
             [*leash, *job.command],
             cwd=job.cwd,
