@@ -168,9 +168,10 @@ def load_checkpoint(
                 f'{folder}: weight {name} has shape {tuple(saved[name].shape)}, '
                 f'the settings ask for {tuple(tensor.shape)}'
             )
-        if saved[name].dtype != tensor.dtype:
+        if saved[name].dtype not in (tensor.dtype, torch.float16):
             raise CheckpointError(
-                f'{folder}: weight {name} is {saved[name].dtype}, expected {tensor.dtype}'
+                f'{folder}: weight {name} is {saved[name].dtype}, expected {tensor.dtype} or '
+                'float16'
             )
         if not torch.isfinite(saved[name]).all():
             raise CheckpointError(f'{folder}: weight {name} holds a non-finite value')

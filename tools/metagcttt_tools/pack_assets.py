@@ -17,7 +17,8 @@ _DESCRIPTION = """Pack trained policies and part of their dataset into the asset
 
 Example: metagcttt pack-assets --preset pointmaze-medium-navigate-cpu
 Checkpoints lose their optimiser state, which is twice as large as the weights, unless
---optimizer-state keeps that of pre-training. The dataset keeps its first trajectories, in half
+--optimizer-state keeps that of pre-training, and with --half-weights half of the weights' size.
+The dataset keeps its first trajectories, in half
 precision (1.6 cm at 20 m) and without the simulator's own state, to be small enough for a
 repository."""
 
@@ -35,6 +36,9 @@ class PackSettings(Settings):
     episodes: int = Field(500, ge=1, description='trajectories to keep')
     optimizer_state: bool = Field(
         False, description='keep the optimiser state of pre-training, for test-time training'
+    )
+    half_weights: bool = Field(
+        False, description='weights in half precision: 3 digits, half the size'
     )
     out: Path = Field(Path('assets/pointmaze-medium-navigate'), description='folder to write')
 
@@ -54,7 +58,7 @@ def main(argv: list[str] | None = None) -> None:
         for name, agent in agents.items():
             if not settings.optimizer_state:
                 agent.optimizer_state = None
-            save_checkpoint(agent, settings.out / name)
+            save_checkpoint(agent.half() if settings.half_weights else agent, settings.out / name)
         pack_dataset(dataset, settings)
     except (DatasetError, CheckpointError) as error:
         fail(str(error))
