@@ -17,10 +17,9 @@ _DESCRIPTION = """Pack trained policies and part of their dataset into the asset
 
 Example: metagcttt pack-assets --preset pointmaze-medium-navigate-cpu
 Checkpoints lose their optimiser state, which is twice as large as the weights, unless
---optimizer-state keeps that of pre-training, and with --half-weights half of the weights' size.
-The dataset keeps its first trajectories, in half
-precision (1.6 cm at 20 m) and without the simulator's own state, to be small enough for a
-repository."""
+--optimizer-state keeps that of pre-training; --half-weights rounds the weights to 3 digits. The
+dataset keeps its first trajectories, in half precision (1.6 cm at 20 m) and without the
+simulator's own state, to be small enough for a repository."""
 
 _DATASET = 'dataset.npz'
 
@@ -37,9 +36,7 @@ class PackSettings(Settings):
     optimizer_state: bool = Field(
         False, description='keep the optimiser state of pre-training, for test-time training'
     )
-    half_weights: bool = Field(
-        False, description='weights in half precision: 3 digits, half the size'
-    )
+    half_weights: bool = Field(False, description='weights in half precision, half as large')
     out: Path = Field(Path('assets/pointmaze-medium-navigate'), description='folder to write')
 
 
