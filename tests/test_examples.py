@@ -63,7 +63,7 @@ def test_agent_of_another_package_trains_with_its_settings_and_adapts(tmp_path, 
 
 def test_help_offers_the_agent_and_its_settings(tmp_path, guests) -> None:
     text = metagcttt(['pretrain', '--help'], tmp_path, guests).stdout
-    assert '--agent {gcbc,gciql,saw,huber}' in text
+    assert '--agent {crl,gcbc,gciql,saw,huber}' in text
     assert '--huber.delta' in text
 
 

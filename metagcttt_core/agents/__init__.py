@@ -7,6 +7,7 @@ from metagcttt_core.lazy import exports
 if TYPE_CHECKING:
     from metagcttt_core.agents.agent import Agent, TensorBatch
     from metagcttt_core.agents.config import AgentName, AgentSettings
+    from metagcttt_core.agents.crl import CRL
     from metagcttt_core.agents.gcbc import GCBC
     from metagcttt_core.agents.gciql import GCIQL
     from metagcttt_core.agents.registry import AGENTS, make_agent
@@ -17,6 +18,7 @@ else:
         {
             'agent': ('Agent', 'TensorBatch'),
             'config': ('AgentName', 'AgentSettings'),
+            'crl': ('CRL',),
             'gcbc': ('GCBC',),
             'gciql': ('GCIQL',),
             'registry': ('AGENTS', 'make_agent'),
@@ -26,6 +28,7 @@ else:
 
 __all__ = [
     'AGENTS',
+    'CRL',
     'GCBC',
     'GCIQL',
     'SAW',

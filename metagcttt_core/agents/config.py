@@ -6,7 +6,7 @@ from pydantic import Field, model_validator, PositiveInt
 
 from metagcttt_core.agents.registry import AGENTS
 from metagcttt_core.config.settings import Settings
-from metagcttt_core.data.relabel import GoalConfig
+from metagcttt_core.data.relabel import GoalConfig, GoalDistribution
 
 if TYPE_CHECKING:
     AgentName = str
@@ -45,13 +45,18 @@ class GCBCOptions(AgentOptions):
         return self
 
 
-class GCIQLOptions(AgentOptions):
-    """Options of GCIQL."""
+class ExtractionOptions(AgentOptions):
+    """Options of agents that extract their actor from a critic."""
 
     actor_loss: ActorLoss = Field('ddpgbc', description='policy extraction')
     alpha: float = Field(
         0.3, ge=0, description='ddpgbc: weight of cloning; awr: inverse temperature of advantages'
     )
+
+
+class GCIQLOptions(ExtractionOptions):
+    """Options of GCIQL."""
+
     expectile: float = Field(0.9, gt=0, lt=1, description='of the value regression')
     tau: float = Field(0.005, gt=0, le=1, description='rate of the target critics')
 
@@ -70,12 +75,32 @@ class SAWOptions(AgentOptions):
     rep_dim: int = Field(10, ge=1, description='width of the goal representations')
 
 
+class CRLOptions(ExtractionOptions):
+    """Options of CRL; the defaults are those of OGBench's code (impls/agents/crl.py)."""
+
+    goals: GoalConfig = GoalConfig(value=GoalDistribution(geometric=True))
+    alpha: float = Field(
+        0.1, ge=0, description='ddpgbc: weight of cloning; awr: inverse temperature of advantages'
+    )
+    latent_dim: int = Field(512, ge=1, description='width of the representations phi and psi')
+
+    @model_validator(mode='after')
+    def _goals_have_no_rewards(self) -> Self:
+        if self.goals.value is None or not self.goals.gc_negative:
+            raise ValueError('CRL needs goals.value, and goals.gc_negative has no effect on it')
+        return self
+
+
 class GCBCSettings(GCBCOptions, AgentSettings):
     """All settings of GCBC."""
 
 
 class GCIQLSettings(GCIQLOptions, AgentSettings):
     """All settings of GCIQL."""
+
+
+class CRLSettings(CRLOptions, AgentSettings):
+    """All settings of CRL."""
 
 
 class SAWSettings(SAWOptions, AgentSettings):

@@ -4,11 +4,11 @@ from collections.abc import Mapping
 from typing import ClassVar, TYPE_CHECKING
 
 import torch
-from torch import nn, Tensor
-from torch.func import functional_call
+from torch import Tensor
 
 from metagcttt_core.agents.agent import Agent, TensorBatch
 from metagcttt_core.agents.config import AgentSettings, GCIQLSettings
+from metagcttt_core.agents.extraction import extraction_loss, frozen
 from metagcttt_core.agents.networks import MLP
 from metagcttt_core.agents.state_value import StateValue
 
@@ -79,33 +79,12 @@ class GCIQL(Agent):
         return sum(error.square().mean() for error in errors)
 
     def _actor_loss(self, batch: TensorBatch) -> tuple[Tensor, dict[str, Tensor]]:
-        observations, goals = batch['observations'], batch['actor_goals']
-        log_prob, mean = self.log_prob(observations, goals, batch['actions'])
-        kind, alpha = self.settings.actor_loss, self.settings.alpha
-        bc = -log_prob.mean()
-        parts = {'bc': bc.detach()}
-        if kind == 'bc':
-            loss = bc
-        elif kind == 'ddpgbc':
-            q = self._frozen_q(_join(observations, goals, mean.clamp(-1, 1)))
-            q_term = -q.mean() / (q.abs().mean().detach() + 1e-6)
-            parts['q'] = q_term.detach()
-            loss = q_term + alpha * bc
-        else:
-            with torch.no_grad():
-                advantage = self._frozen_q(_join(observations, goals, batch['actions']))
-                advantage -= self.value(_join(observations, goals)).squeeze(-1)
-                weight = torch.exp(alpha * advantage).clamp(max=100)
-            parts['advantage'] = advantage.mean()
-            loss = -(weight * log_prob).mean()
-        return loss, parts | {'actor': loss.detach()}
+        return extraction_loss(self, self.settings, batch, self._frozen_q, self.state_value)
 
-    def _frozen_q(self, inputs: Tensor) -> Tensor:
+    def _frozen_q(self, observations: Tensor, goals: Tensor, actions: Tensor) -> Tensor:
         """The smaller critic (B,), differentiable in its inputs but not in its weights."""
-        qs = [
-            functional_call(critic, _detached(critic), (inputs,))
-            for critic in (self.critic1, self.critic2)
-        ]
+        inputs = _join(observations, goals, actions)
+        qs = [frozen(critic, inputs) for critic in (self.critic1, self.critic2)]
         return torch.minimum(*qs).squeeze(-1)
 
     def analytic_loss(
@@ -141,7 +120,3 @@ class GCIQL(Agent):
 
 def _join(*parts: Tensor) -> Tensor:
     return torch.cat(parts, dim=-1)
-
-
-def _detached(module: nn.Module) -> dict[str, Tensor]:
-    return {name: weight.detach() for name, weight in module.named_parameters()}

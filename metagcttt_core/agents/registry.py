@@ -14,6 +14,7 @@ AGENTS: Registry[type[Agent]] = Registry(
     'metagcttt.agents',
     'agent',
     {
+        'crl': 'metagcttt_core.agents.crl:CRL',
         'gcbc': 'metagcttt_core.agents.gcbc:GCBC',
         'gciql': 'metagcttt_core.agents.gciql:GCIQL',
         'saw': 'metagcttt_core.agents.saw:SAW',

@@ -180,6 +180,16 @@ def load_checkpoint(
                 f'{folder}: weight {name} has shape {tuple(saved[name].shape)}, '
                 f'the settings ask for {tuple(tensor.shape)}'
             )
+<<<<<<< HEAD
+=======
+        if saved[name].dtype not in (tensor.dtype, torch.float16):
+            raise CheckpointError(
+                f'{folder}: weight {name} is {saved[name].dtype}, expected {tensor.dtype} or '
+                'float16'
+            )
+        if not torch.isfinite(saved[name]).all():
+            raise CheckpointError(f'{folder}: weight {name} holds a non-finite value')
+>>>>>>> ant
     agent = agent_type(index.obs_dim, index.act_dim, settings, torch.Generator())
     if index.scaling is not None:
         try:

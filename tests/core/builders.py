@@ -51,13 +51,16 @@ def dataset_at(trajectories: Sequence[Sequence[Any]], act_dim: int = 2) -> Traje
     )
 
 
-# Advantages of random values would weigh up to 100, with which large steps end in nan.
-GENTLE = {'saw': dict.fromkeys(('alpha', 'subpolicy_alpha', 'waypoint_alpha'), 0.1)}
+USUAL = {
+    'crl': {'latent_dim': 5},
+    # Advantages of random values would weigh up to 100, with which large steps end in nan.
+    'saw': dict.fromkeys(('alpha', 'subpolicy_alpha', 'waypoint_alpha'), 0.1),
+}
 
 
 def tiny_agent(name: str = 'gcbc', seed: int = 0, **settings: Any) -> Agent:
     """An agent of a few dozen weights, in which no weight has its special initial value."""
-    usual = {'obs_dim': 2, 'act_dim': 2, 'hidden': (6,), **GENTLE.get(name, {})}
+    usual = {'obs_dim': 2, 'act_dim': 2, 'hidden': (6,), **USUAL.get(name, {})}
     agent = make_agent(name, seed=seed, **(usual | settings))
     generator = torch.Generator().manual_seed(seed + 1)
     with torch.no_grad():

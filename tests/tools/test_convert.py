@@ -65,6 +65,29 @@ def as_names_of_saw(arrays):
     return renamed
 
 
+def as_ogbench_names_of_crl(arrays):
+    """The arrays as OGBench's CRL names and stacks them, from three hidden layers."""
+    renamed = {}
+    for name, array in arrays.items():
+        net, _, rest = name.partition('.')
+        for index in range(3):
+            rest = rest.replace(f'fc{index}.', f'Dense_{index}.')
+            rest = rest.replace(f'ln{index}.', f'LayerNorm_{index}.')
+        if net == 'actor':
+            own = rest == 'log_stds' or rest.startswith('mean.')
+            inner = rest.replace('mean.', 'mean_net.') if own else f'actor_net.{rest}'
+            renamed[f'modules_actor.{inner}'] = array
+            continue
+        rest = rest.replace('out.', 'Dense_3.')
+        if net == 'value':
+            renamed[f'modules_value.{rest}'] = array
+        elif net == 'critic1':
+            renamed[f'modules_critic.{rest}'] = np.stack(
+                [array, arrays[name.replace('critic1', 'critic2')]]
+            )
+    return renamed
+
+
 def save(path, arrays):
     np.savez(path, **arrays)
     return path
@@ -112,6 +135,19 @@ def test_exported_saw_comes_back_under_either_names(const_std, rename, tmp_path)
     assert_bit_equal(converted, weights_of(agent))
     assert converted.settings == agent.settings
     assert (converted.obs_dim, converted.act_dim) == (3, 2)
+
+
+@pytest.mark.parametrize('actor_loss', ['ddpgbc', 'awr'])
+@pytest.mark.parametrize('rename', [dict, as_ogbench_names_of_crl])
+def test_exported_crl_comes_back_under_either_names(actor_loss, rename, tmp_path):
+    usual = {'latent_dim': 512, 'actor_loss': actor_loss}
+    agent = tiny_agent('crl', obs_dim=3, act_dim=2, hidden=(6, 5, 4), **usual)
+    file = save(tmp_path / 'params.npz', rename(agent.export_reference_parameters()))
+    out = ['--out', str(tmp_path / 'converted'), '--actor-loss', actor_loss]
+    convert_checkpoint.main([str(file), '--agent', 'crl', *out])
+    converted = load_checkpoint(tmp_path / 'converted')
+    assert_bit_equal(converted, weights_of(agent))
+    assert converted.settings == agent.settings
 
 
 def test_ogbench_names_stack_the_twin_critics(tmp_path):

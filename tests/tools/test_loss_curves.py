@@ -25,7 +25,7 @@ def query():
     return dataset, support, goal
 
 
-@pytest.mark.parametrize('name', ['gcbc', 'gciql', 'saw'])
+@pytest.mark.parametrize('name', ['crl', 'gcbc', 'gciql', 'saw'])
 @pytest.mark.parametrize('actor_only', [False, True])
 def test_losses_are_those_of_the_adaptation(name, actor_only, query):
     agent = tiny_agent(name)
@@ -34,7 +34,7 @@ def test_losses_are_those_of_the_adaptation(name, actor_only, query):
     losses = adaptation_losses(agent, *query, config, seed=4)
     assert losses['total'] == adapt(agent, *query, config, seed=4).train_losses
     assert_bit_equal(agent, weights)
-    others = {'gciql': ('critic', 'value'), 'saw': ('subpolicy', 'value')}
+    others = {'crl': ('critic',), 'gciql': ('critic', 'value'), 'saw': ('subpolicy', 'value')}
     if name in others:
         parts = ('actor', *(() if actor_only else others[name]))
         np.testing.assert_allclose(losses['total'], sum(np.array(losses[p]) for p in parts), 1e-5)

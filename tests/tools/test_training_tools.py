@@ -286,6 +286,19 @@ def test_packed_policies_have_their_optimizer_state_when_asked(kept, dataset_pat
     assert (agent.optimizer_state is not None) == kept
 
 
+def test_half_weights_are_half_as_large_and_load_as_whole_ones(dataset_path, base, tmp_path):
+    arguments = ['--base', str(base), '--meta', str(base), '--dataset', str(dataset_path)]
+    sizes = {}
+    for name, further in (('whole', []), ('half', ['--half-weights'])):
+        pack_assets.main([*arguments, *further, '--out', str(tmp_path / name)])
+        (weights,) = (tmp_path / name / 'meta').glob('*.safetensors')
+        sizes[name] = weights.stat().st_size
+    assert sizes['half'] < 0.7 * sizes['whole']
+    whole, half = (load_checkpoint(tmp_path / name / 'meta').state_dict() for name in sizes)
+    for name, weight in whole.items():
+        torch.testing.assert_close(half[name], weight, rtol=1e-3, atol=1e-6)
+
+
 def test_packed_data_keep_their_contract(dataset_path, base, tmp_path):
     data = TrajectoryDataset.load(dataset_path)
     identity = contract().identity

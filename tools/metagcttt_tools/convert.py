@@ -41,8 +41,8 @@ class ConvertSettings(Settings):
     discount: float = Field(
         0.99, gt=0, lt=1, description='discount that the agent was trained with'
     )
-    actor_loss: ActorLoss | None = Field(None, description='of GCIQL, to train it further')
-    alpha: float | None = Field(None, ge=0, description='of GCIQL, to train it further')
+    actor_loss: ActorLoss | None = Field(None, description='of GCIQL and CRL, to train it further')
+    alpha: float | None = Field(None, ge=0, description='of its actor loss, to train it further')
     prefix: str = Field('', description='convert only the arrays under this name, such as init')
     out: Path = Field(Path('out/converted'), description='folder for the checkpoint')
 
@@ -147,8 +147,8 @@ def from_ogbench_names(
         rest = re.sub(r'^(actor_net|value_net|layers_0)\.', '', rest).replace('mean_net.', 'mean.')
         if f'{net}.mean_net.kernel' not in arrays:
             rest = rest.replace(f'Dense_{heads[net]}.', 'out.')
-        rest = re.sub(r'^Dense_(\d+)\.', r'fc\1.', rest)
-        rest = re.sub(r'^LayerNorm_(\d+)\.', r'ln\1.', rest)
+        rest = re.sub(r'\bDense_(\d+)\.', r'fc\1.', rest)
+        rest = re.sub(r'\bLayerNorm_(\d+)\.', r'ln\1.', rest)
         targets = networks[net]
         if len(targets) == 1:
             renamed[f'{targets[0]}.{rest}'] = array
@@ -162,5 +162,5 @@ def from_ogbench_names(
 
 
 def _last_dense(arrays: Mapping[str, np.ndarray], net: str) -> int | None:
-    pattern = re.compile(rf'{net}\.(?:value_net|layers_0)\.Dense_(\d+)\.kernel')
+    pattern = re.compile(rf'{net}\.(?:value_net|layers_0|phi)\.Dense_(\d+)\.kernel')
     return max((int(m[1]) for m in map(pattern.fullmatch, arrays) if m), default=None)

@@ -5,61 +5,81 @@ from __future__ import annotations
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TYPE_CHECKING
+from typing import Any, Literal, NamedTuple, TYPE_CHECKING
 
-from metagcttt_core import TrajectoryDataset
-from metagcttt_core.config import assets_dir, Settings
-from metagcttt_core.files import refuse_foreign, write_json
+from metagcttt_core.config import Settings
+from metagcttt_core.files import refuse_foreign
 import numpy as np
 from pydantic import Field, model_validator
 from sim_bridge import make_simulator
 
+from metagcttt_tools.common import demo_report
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.results import markdown_table
-from metagcttt_tools.common.session import provenance
 
 if TYPE_CHECKING:
     from metagcttt_tools.graph.client import GoalOutcome
 
-_DESCRIPTION = """Drive to five goals over ROS 2 with three policies: the point maze, or a robot.
+_DESCRIPTION = """Drive to five goals over ROS 2 with three policies: a point, an ant, or a robot.
 
 Example: make demo, or metagcttt demo in a set-up checkout
 Starts sim_bridge_node, goal_node and policy_node as separate processes, publishes the five
 evaluation goals on `goal_pose` for each arm, prints a table and writes OUT/summary.json and
-OUT/demo.png. With --robot diffbot it is a robot with two wheels, which speaks standard messages
-alone, and robot_bridge_node. With --view the goals are yours: the post-trained policy drives to
-where you click in a browser, until Ctrl-C."""
+OUT/demo.png. With --robot ant an ant walks through the same maze, and --film shows it; with
+--robot diffbot it is a robot with two wheels, which speaks standard messages alone, and
+robot_bridge_node. With --view the goals are yours: the post-trained policy drives to where you
+click in a browser, until Ctrl-C."""
 
-_ENVIRONMENT = 'pointmaze-medium-v0'
-_ASSETS = 'pointmaze-medium-navigate'
+
+class _Maze(NamedTuple):
+    """A maze to drive: its simulator, its assets and the preset that packs them."""
+
+    environment: str
+    assets: str
+    preset: str
+
+
+_MAZES = {
+    'point': _Maze(
+        'pointmaze-medium-v0', 'pointmaze-medium-navigate', 'pointmaze-medium-navigate-cpu'
+    ),
+    'ant': _Maze('antmaze-medium-v0', 'antmaze-medium-navigate', 'antmaze-medium-navigate-saw'),
+}
 
 
 class DemoSettings(Settings):
     """Settings of the program."""
 
-    robot: Literal['point', 'diffbot'] = Field(
-        'point', description='the point maze, or the robot with two wheels in its room'
+    robot: Literal['point', 'ant', 'diffbot'] = Field(
+        'point',
+        description='the point or the ant in the medium maze, or the robot with two wheels in '
+        'its room',
     )
     out: Path = Field(Path('out/demo'), description='folder for summary, picture and node logs')
     steps: int | None = Field(
         None,
         ge=1,
-        description='test-time training steps K of the adapting arms; by default 10, and 50 for '
-        'the diffbot',
+        description='test-time training steps K of the adapting arms; by default 10 for the '
+        'point, 50 for ant and diffbot',
     )
     seed: int = Field(0, ge=0, description='random seed of starts, goals and adaptations')
-    timeout_s: float = Field(60.0, gt=0, description='longest wait for one goal, seconds')
+    timeout_s: float = Field(120.0, gt=0, description='longest wait for one goal, seconds')
+    film: Path | None = Field(None, description='also film the ant with each policy, a GIF')
     view: bool = Field(False, description='send the goals by hand, in the live view')
 
     @property
     def budget(self) -> int:
         """Test-time training steps K."""
-        return self.steps or {'point': 10, 'diffbot': 50}[self.robot]
+        return self.steps or {'point': 10, 'ant': 50, 'diffbot': 50}[self.robot]
 
     @model_validator(mode='after')
-    def _the_view_is_of_the_maze(self) -> DemoSettings:
+    def _robot_can_be_shown(self) -> DemoSettings:
         if self.view and self.robot != 'point':
             raise ValueError(f'view shows the point maze, not {self.robot}')
+        if self.film and self.robot != 'ant':
+            raise ValueError(f'film shows the ant, not {self.robot}')
+        if self.film and self.film.suffix != '.gif':
+            raise ValueError(f'film must end in .gif, got {self.film.name}')
         return self
 
 
@@ -67,6 +87,7 @@ def main(argv: list[str] | None = None) -> None:
     """Run the program."""
     settings = parse(DemoSettings, _DESCRIPTION, 'demo', argv)
     from metagcttt.commander import NoAnswerError
+    from sim_bridge.simulator import SimulatorError
 
     from metagcttt_tools.graph.process import NodeFailedError
 
@@ -74,7 +95,8 @@ def main(argv: list[str] | None = None) -> None:
         if settings.view:
             drive_by_hand(settings)
             return
-        refuse_foreign(settings.out / 'summary.json', settings.out / 'demo.png')
+        film = [settings.film] if settings.film else []
+        refuse_foreign(settings.out / 'summary.json', settings.out / 'demo.png', *film)
         if settings.robot == 'diffbot':
             from metagcttt_tools import demo_robot
 
@@ -86,28 +108,39 @@ def main(argv: list[str] | None = None) -> None:
                 out=settings.out,
             )
             return
-        outcomes = run_arms(settings)
-    except (NodeFailedError, NoAnswerError, FileNotFoundError, FileExistsError) as error:
+        maze = _MAZES[settings.robot]
+        assets = demo_report.packed_assets(maze.assets, maze.preset)
+        outcomes = run_arms(settings, maze.environment, assets)
+        report(settings, maze.environment, assets / 'dataset.npz', outcomes)
+        if settings.film:
+            from metagcttt_tools import demo_film
+
+            demo_film.film(maze.environment, outcomes, settings.film)
+            print(f'film: {settings.film}')
+    except (
+        NodeFailedError,
+        NoAnswerError,
+        SimulatorError,
+        FileNotFoundError,
+        FileExistsError,
+    ) as error:
         fail(str(error))
     except KeyboardInterrupt:
         raise SystemExit(130) from None
-    report(settings, outcomes)
 
 
-def run_arms(settings: DemoSettings) -> dict[str, list[GoalOutcome]]:
+def run_arms(
+    settings: DemoSettings, environment: str, assets: Path
+) -> dict[str, list[GoalOutcome]]:
     """Outcome of each task's goal by arm, from three processes that talk over DDS."""
     from metagcttt_tools.graph.client import MazeClient
     from metagcttt_tools.graph.drive import drive_arms
 
-    arms = {
-        'base policy': ('base', 0),
-        f'base + TTT (K = {settings.budget})': ('base', settings.budget),
-        f'meta + TTT (K = {settings.budget})': ('meta', settings.budget),
-    }
+    dataset = {'dataset': str(assets / 'dataset.npz')}
     return drive_arms(
         {
-            arm: {'checkpoint': str(assets_dir() / _ASSETS / checkpoint), 'adapt_steps': steps}
-            for arm, (checkpoint, steps) in arms.items()
+            arm: {**dataset, 'checkpoint': str(checkpoint), 'adapt_steps': steps}
+            for arm, (checkpoint, steps) in demo_report.arms_of(assets, settings.budget).items()
         },
         [
             partial(
@@ -116,9 +149,11 @@ def run_arms(settings: DemoSettings) -> dict[str, list[GoalOutcome]]:
                 seed=settings.seed,
                 timeout_s=settings.timeout_s,
             )
-            for task in make_simulator(_ENVIRONMENT).tasks
+            for task in make_simulator(environment).tasks
         ],
         logs=settings.out / 'logs',
+        simulator={'environment': environment},
+        goal_node={'environment': environment, **dataset},
     )
 
 
@@ -141,41 +176,22 @@ def drive_by_hand(settings: DemoSettings) -> None:
         show(out=settings.out, check=partial(check, nodes))
 
 
-def report(settings: DemoSettings, outcomes: dict[str, list[GoalOutcome]]) -> None:
+def report(
+    settings: DemoSettings,
+    environment: str,
+    dataset: Path,
+    outcomes: dict[str, list[GoalOutcome]],
+) -> None:
     """Print the table; write the summary and the picture."""
-    from metagcttt_tools.common.plots import demo_picture, save
-
-    summary = {
-        'environment': _ENVIRONMENT,
-        'settings': settings.model_dump(mode='json'),
-        **provenance(),
-        'arms': {
-            arm: [{'task': task, **numbers(outcome)} for task, outcome in enumerate(results, 1)]
-            for arm, results in outcomes.items()
-        },
-    }
-    write_json(settings.out / 'summary.json', summary)
-    dataset = TrajectoryDataset.load(assets_dir() / _ASSETS / 'dataset.npz')
-    simulator = make_simulator(_ENVIRONMENT)
-    last = list(outcomes.values())[-1]
-    figure = demo_picture(
-        simulator.maze,
-        paths={arm: [np.array(o.path) for o in results] for arm, results in outcomes.items()},
-        successes={arm: [o.success for o in results] for arm, results in outcomes.items()},
-        segments=[
-            [
-                dataset.observations[start:stop, :2]
-                for start, stop in zip(
-                    o.report.segment_starts, o.report.segment_stops, strict=True
-                )
-            ]
-            for o in last
-        ],
-        goals=[outcome.goal for outcome in last],
+    print(format_table(outcomes))
+    goals = [outcome.goal for outcome in next(iter(outcomes.values()))]
+    demo_report.write_report(
+        settings.out,
+        {'environment': environment, 'settings': settings.model_dump(mode='json')},
+        outcomes,
+        numbers,
+        partial(demo_report.draw, make_simulator(environment).maze, dataset, goals, outcomes),
     )
-    save(figure, settings.out / 'demo.png')
-    print(format_table(summary['arms']))
-    print(f'summary: {settings.out / "summary.json"}\npicture: {settings.out / "demo.png"}')
 
 
 def numbers(outcome: GoalOutcome) -> dict[str, Any]:
@@ -190,8 +206,9 @@ def numbers(outcome: GoalOutcome) -> dict[str, Any]:
     }
 
 
-def format_table(arms: dict[str, list[dict[str, Any]]]) -> str:
+def format_table(outcomes: dict[str, list[GoalOutcome]]) -> str:
     """The arms side by side, as Markdown."""
+    arms = {arm: [numbers(outcome) for outcome in results] for arm, results in outcomes.items()}
     return markdown_table(
         [
             {

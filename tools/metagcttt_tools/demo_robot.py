@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
-from metagcttt_core import TrajectoryDataset
-from metagcttt_core.config import assets_dir
 from metagcttt_core.config.yaml_file import load_yaml
-from metagcttt_core.files import write_json
 import numpy as np
 from sim_bridge.maze_map import MazeMap
 
+from metagcttt_tools.common import demo_report
 from metagcttt_tools.common.results import markdown_table
-from metagcttt_tools.common.session import provenance
 from metagcttt_tools.evaluate_robot import drive_robot, GraphSettings, numbers, RobotTasks
 
 if TYPE_CHECKING:
@@ -37,32 +35,25 @@ def run(robot: str, *, steps: int, seed: int, timeout_s: float, out: Path) -> No
         NodeFailedError: If a node ends; with its log.
         NoAnswerError: If a node does not answer in time; with all logs.
     """
-    assets = assets_dir() / robot
+    assets = demo_report.packed_assets(robot, robot)
     graph = GraphSettings(
         contract=_CONTRACTS / f'{robot}.yaml',
         dataset=assets / 'dataset.npz',
         tasks=assets / 'tasks.yaml',
         timeout_s=timeout_s,
     )
-    arms = {
-        'base policy': (assets / 'base', 0),
-        f'base + TTT (K = {steps})': (assets / 'base', steps),
-        f'meta + TTT (K = {steps})': (assets / 'meta', steps),
-    }
-    outcomes = drive_robot(graph, arms, out / 'logs', seed)
-    summary = {
-        'robot': robot,
-        'settings': {**graph.model_dump(mode='json'), 'steps': steps, 'seed': seed},
-        **provenance(),
-        'arms': {
-            arm: [{'task': task, **numbers(outcome)} for task, outcome in enumerate(results, 1)]
-            for arm, results in outcomes.items()
-        },
-    }
-    write_json(out / 'summary.json', summary)
-    _draw(graph, outcomes, out / 'demo.png')
+    outcomes = drive_robot(graph, demo_report.arms_of(assets, steps), out / 'logs', seed)
     print(format_table(outcomes))
-    print(f'summary: {out / "summary.json"}\npicture: {out / "demo.png"}')
+    about: dict[str, Any] = {'robot': robot, 'settings': graph.model_dump(mode='json')}
+    about['settings'] |= {'steps': steps, 'seed': seed}
+    goals = [task.position for task in load_yaml(graph.tasks, RobotTasks).tasks]
+    demo_report.write_report(
+        out,
+        about,
+        outcomes,
+        numbers,
+        partial(demo_report.draw, _room(), graph.dataset, goals, outcomes),
+    )
 
 
 def format_table(arms: dict[str, list[RobotOutcome]]) -> str:
@@ -89,30 +80,9 @@ def format_table(arms: dict[str, list[RobotOutcome]]) -> str:
     )
 
 
-def _draw(graph: GraphSettings, outcomes: dict[str, list[RobotOutcome]], path: Path) -> None:
-    """One panel a task, over the plan of the room."""
+def _room() -> MazeMap:
+    """The plan of the room."""
     from metagcttt_robots.room import lower_corner, obstacles, UNIT_M
 
-    from metagcttt_tools.common.plots import demo_picture, save
-
     x, y = lower_corner()
-    room = MazeMap(obstacles(), UNIT_M, (x + UNIT_M / 2, y + UNIT_M / 2))
-    dataset = TrajectoryDataset.load(graph.dataset)
-    tasks = load_yaml(graph.tasks, RobotTasks).tasks
-    last = list(outcomes.values())[-1]
-    figure = demo_picture(
-        room,
-        paths={arm: [np.array(each.path) for each in drives] for arm, drives in outcomes.items()},
-        successes={arm: [each.success for each in drives] for arm, drives in outcomes.items()},
-        segments=[
-            [
-                dataset.observations[start:stop, :2]
-                for start, stop in zip(
-                    each.report.segment_starts, each.report.segment_stops, strict=True
-                )
-            ]
-            for each in last
-        ],
-        goals=[task.position for task in tasks],
-    )
-    save(figure, path)
+    return MazeMap(obstacles(), UNIT_M, (x + UNIT_M / 2, y + UNIT_M / 2))

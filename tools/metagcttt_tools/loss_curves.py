@@ -58,7 +58,7 @@ class LossCurvesSettings(Settings):
     )
     ttt: LossCurvesTTT = Field(LossCurvesTTT(), description='test-time training')
     actor_loss: ActorLoss | None = Field(
-        None, description='actor loss to adapt a GCIQL policy with; its own by default'
+        None, description='actor loss to adapt a GCIQL or CRL policy with; its own by default'
     )
     filter: FilterConfig = FilterConfig()
     seed: int = Field(0, ge=0, description='random seed of start and batches')

@@ -40,7 +40,7 @@ class MetaTrainSettings(RunSettings):
     checkpoint: Path = Field(Path('out/pretrain/checkpoint'), description='pre-trained policy')
     out: Path = Field(Path('out/meta'), description='folder of the run')
     actor_loss: ActorLoss | None = Field(
-        None, description='actor loss of a GCIQL policy from here on; its own by default'
+        None, description='actor loss of a GCIQL or CRL policy from here on; its own by default'
     )
     meta: MetaConfig = MetaConfig()
     checkpoint_every: int = Field(100, ge=1, description='outer steps between checkpoints')

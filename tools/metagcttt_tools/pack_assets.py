@@ -17,9 +17,9 @@ _DESCRIPTION = """Pack trained policies and part of their dataset into the asset
 
 Example: metagcttt pack-assets --preset pointmaze-medium-navigate-cpu
 Checkpoints lose their optimiser state, which is twice as large as the weights, unless
---optimizer-state keeps that of pre-training. The dataset keeps its first trajectories, in half
-precision (1.6 cm at 20 m) and without the simulator's own state, to be small enough for a
-repository."""
+--optimizer-state keeps that of pre-training; --half-weights rounds the weights to 3 digits. The
+dataset keeps its first trajectories, in half precision (1.6 cm at 20 m) and without the
+simulator's own state, to be small enough for a repository."""
 
 _DATASET = 'dataset.npz'
 
@@ -36,6 +36,7 @@ class PackSettings(Settings):
     optimizer_state: bool = Field(
         False, description='keep the optimiser state of pre-training, for test-time training'
     )
+    half_weights: bool = Field(False, description='weights in half precision, half as large')
     out: Path = Field(Path('assets/pointmaze-medium-navigate'), description='folder to write')
 
 
@@ -54,7 +55,7 @@ def main(argv: list[str] | None = None) -> None:
         for name, agent in agents.items():
             if not settings.optimizer_state:
                 agent.optimizer_state = None
-            save_checkpoint(agent, settings.out / name)
+            save_checkpoint(agent.half() if settings.half_weights else agent, settings.out / name)
         pack_dataset(dataset, settings)
     except (DatasetError, CheckpointError) as error:
         fail(str(error))

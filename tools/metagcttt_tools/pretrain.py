@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self, TYPE_CHECKING
 
 from metagcttt_core import DatasetError, TrajectoryDataset
 from metagcttt_core.agents import AgentName, AGENTS
-from metagcttt_core.agents.config import GCBCOptions, GCIQLOptions, SAWOptions
+from metagcttt_core.agents.config import CRLOptions, GCBCOptions, GCIQLOptions, SAWOptions
 from metagcttt_core.plugins import PluginError
 from metagcttt_core.training.config import Precision, PretrainConfig
 from pydantic import create_model, Field, model_validator
@@ -47,6 +47,7 @@ class PretrainSettings(RunSettings):
     hidden: tuple[int, ...] = Field((512, 512, 512), description='units of each hidden layer')
     gcbc: Annotated[GCBCOptions, tyro.conf.AvoidSubcommands] = GCBCOptions()
     gciql: Annotated[GCIQLOptions, tyro.conf.AvoidSubcommands] = GCIQLOptions()
+    crl: Annotated[CRLOptions, tyro.conf.AvoidSubcommands] = CRLOptions()
     saw: Annotated[SAWOptions, tyro.conf.AvoidSubcommands] = SAWOptions()
     standardise: Literal['auto', 'yes', 'no'] = Field(
         'auto',

@@ -116,7 +116,7 @@ def test_drawing_changes_neither_dataset_nor_goal(dataset):
     assert batches.sample(8, np.random.default_rng(0))['actor_goals'][0] == -7
 
 
-@pytest.mark.parametrize('name', ['gcbc', 'gciql', 'saw'])
+@pytest.mark.parametrize('name', ['crl', 'gcbc', 'gciql', 'saw'])
 @pytest.mark.parametrize('ratio', [1.0, 0.5])
 @pytest.mark.parametrize('steps_at_once', [1, 3, 64])
 def test_batches_of_many_steps_equal_one_sample_after_another(

@@ -17,6 +17,8 @@ BACKBONES = pytest.mark.parametrize(
         ('gciql', {'actor_loss': 'awr'}),
         ('gciql', {'actor_loss': 'ddpgbc'}),
         ('saw', {}),
+        ('crl', {}),
+        ('crl', {'actor_loss': 'awr'}),
     ],
 )
 OPTIMIZERS = pytest.mark.parametrize(('optimizer', 'lr'), [('adam', 0.1), ('sgd', 0.1)])

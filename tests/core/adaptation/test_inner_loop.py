@@ -112,7 +112,7 @@ def test_no_batches_give_the_base_weights():
 @EVERY_AGENT
 def test_early_stopping_keeps_the_weights_of_the_smallest_test_loss(name):
     base = tiny_agent(name)
-    lr = 0.05 if name == 'saw' else 0.6  # at which the test loss rises in the end
+    lr = {'crl': 0.3, 'saw': 0.05}.get(name, 0.6)  # at which the test loss rises in the end
     batches, (test_batch,) = batches_for(base, 12), batches_for(base, 1, seed=9)
     result = run_inner_loop(base, batches, lr=lr, test_batch=test_batch)
     # The loss of every intermediate agent, by running each number of steps on its own.

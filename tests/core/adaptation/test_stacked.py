@@ -17,6 +17,8 @@ AGENTS = [
     ('gciql', {'actor_loss': 'awr'}),
     ('gciql', {'actor_loss': 'ddpgbc'}),
     ('saw', {}),
+    ('crl', {}),
+    ('crl', {'actor_loss': 'awr'}),
     ('saw', {'const_std': False, 'alpha': 0.5}),
 ]
 SIZES = [7, 16, 7, 3]  # of the test batches: two tasks share one
@@ -60,7 +62,7 @@ def test_each_task_ends_as_if_adapted_alone(name, settings, actor_only, optimize
             torch.testing.assert_close(first.agent.state_dict()[key], weight, rtol=1e-7, atol=1e-9)
 
 
-@pytest.mark.parametrize('name', ['gcbc', 'gciql', 'saw'])
+@pytest.mark.parametrize('name', ['crl', 'gcbc', 'gciql', 'saw'])
 def test_without_a_test_batch_every_step_counts(name):
     base = tiny_agent(name)
     train, _ = tasks_for(base)

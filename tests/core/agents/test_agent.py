@@ -212,7 +212,7 @@ def test_default_network_is_the_published_one():
     [
         (
             {'name': 'gcbb'},
-            "unknown agent 'gcbb'; did you mean 'gcbc'\\? \\(known: gcbc, gciql, saw\\)",
+            "unknown agent 'gcbb'; did you mean 'gcbc'\\? \\(known: crl, gcbc, gciql, saw\\)",
         ),
         ({'obs_dim': 0}, 'obs_dim must be at least 1, got 0'),
         ({'act_dim': -1}, 'act_dim must be at least 1, got -1'),

@@ -72,7 +72,7 @@ def test_ordinary_data_are_left_alone_in_bits():
     assert dataset.states(slice(None)).dtype == np.float32
 
 
-@pytest.mark.parametrize('name', ['gcbc', 'gciql', 'saw'])
+@pytest.mark.parametrize('name', ['crl', 'gcbc', 'gciql', 'saw'])
 def test_everything_is_the_same_far_from_the_origin(name, tmp_path):
     """Pre-training, post-training, retrieval, adaptation and acting, after a checkpoint."""
     found = []

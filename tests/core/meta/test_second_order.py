@@ -57,7 +57,7 @@ def test_gradient_equals_finite_differences(const_std, optimizer, num_steps):
             assert gradient.view(-1)[index].item() == pytest.approx(slope, rel=2e-4, abs=1e-6)
 
 
-@pytest.mark.parametrize('name', ['gcbc', 'gciql', 'saw'])
+@pytest.mark.parametrize('name', ['crl', 'gcbc', 'gciql', 'saw'])
 @pytest.mark.parametrize('optimizer', ['sgd', 'adam'])
 def test_without_the_second_order_term_it_is_fomaml(name, optimizer):
     agent = tiny_agent(name).double()

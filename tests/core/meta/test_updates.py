@@ -45,7 +45,7 @@ def assert_constant(agent, value: float) -> None:
         torch.testing.assert_close(weight, torch.full_like(weight, value))
 
 
-@pytest.mark.parametrize('name', ['gcbc', 'gciql', 'saw'])
+@pytest.mark.parametrize('name', ['crl', 'gcbc', 'gciql', 'saw'])
 @pytest.mark.parametrize(('adapted', 'expected'), [([5.0], 5.0), ([2.0, 4.0, 9.0], 5.0)])
 def test_continual_takes_the_mean_of_the_adapted_weights(name, adapted, expected):
     base = constant(1.0, name)
@@ -53,7 +53,7 @@ def test_continual_takes_the_mean_of_the_adapted_weights(name, adapted, expected
     assert_constant(base, expected)
 
 
-@pytest.mark.parametrize('name', ['gcbc', 'gciql', 'saw'])
+@pytest.mark.parametrize('name', ['crl', 'gcbc', 'gciql', 'saw'])
 @pytest.mark.parametrize('adapted', [[5.0], [2.0, 4.0, 9.0]])
 def test_reptile_moves_by_beta_towards_the_mean(name, adapted):
     base = constant(1.0, name)

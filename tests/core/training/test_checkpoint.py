@@ -237,7 +237,7 @@ def test_other_version_is_refused_by_number(version, tmp_path):
 @pytest.mark.parametrize(
     ('changes', 'message'),
     [
-        ({'agent': 'dqn'}, "unknown agent 'dqn'; known: gcbc, gciql, saw"),
+        ({'agent': 'dqn'}, "unknown agent 'dqn'; known: crl, gcbc, gciql, saw"),
         ({'agent': None}, 'agent: Field required'),
         ({'obs_dim': 0}, 'obs_dim: Input should be greater than or equal to 1, got 0'),
         ({'act_dim': 'two'}, "act_dim: Input should be a valid integer.*, got 'two'"),

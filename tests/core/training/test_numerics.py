@@ -18,6 +18,8 @@ LEARNERS = pytest.mark.parametrize(
         ('gcbc', {}),
         *(('gciql', {'actor_loss': loss, 'alpha': 0.1}) for loss in ('bc', 'awr', 'ddpgbc')),
         ('saw', {}),
+        ('crl', {}),
+        ('crl', {'actor_loss': 'awr'}),
     ],
 )
 
@@ -110,7 +112,7 @@ def test_compiled_code_is_made_for_the_number_of_threads(monkeypatch):
     assert asked[0]['cpp.threads'] == 3
 
 
-@pytest.mark.parametrize('name', ['gcbc', 'gciql', 'saw'])
+@pytest.mark.parametrize('name', ['crl', 'gcbc', 'gciql', 'saw'])
 def test_pretraining_in_bfloat16_repeats_to_the_bit_and_keeps_float32_weights(name):
     agent = make_agent(name, obs_dim=2, act_dim=2, hidden=(16, 16))
     config = PretrainConfig(steps=3, batch_size=16)

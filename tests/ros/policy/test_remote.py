@@ -52,7 +52,7 @@ def expert_of(rig: PolicyRig) -> Expert:
     return message
 
 
-@pytest.mark.parametrize('agent', ['gcbc', 'gciql'])
+@pytest.mark.parametrize('agent', ['crl', 'gcbc', 'gciql'])
 def test_expert_of_the_adapter_is_the_node_s_own_bit_for_bit(
     make_rig: MakeRig, graph: Graph, files: dict[str, str], agent: str, tmp_path: Path
 ) -> None:

@@ -257,6 +257,7 @@ PACK = Walk(
         'dataset': '@half.npz',
         'episodes': 2,
         'optimizer_state': True,
+        'half_weights': True,
         'out': 'elsewhere',
     },
 )

@@ -9,9 +9,10 @@ from metagcttt import commander
 import metagcttt_core
 from metagcttt_core.config import assets_dir
 from metagcttt_interfaces.srv import Adapt
-from metagcttt_tools import demo, demo_robot
+from metagcttt_tools import demo, demo_film
 from metagcttt_tools.benchmarks import adapter, restarts, ros, state_source
 from metagcttt_tools.benchmarks.fleet_robot import Outcome
+from metagcttt_tools.common import demo_report
 from metagcttt_tools.graph import drive
 from metagcttt_tools.graph import process as nodes
 from metagcttt_tools.graph.robot import RobotOutcome
@@ -35,6 +36,8 @@ def watch_graph(patch: pytest.MonkeyPatch, seen: Seen) -> None:
 
     patch.setattr(drive, 'drive_arms', note)
     patch.setattr(demo, 'report', lambda *_: None)
+    patch.setattr(demo_report, 'packed_assets', lambda name, preset: assets_dir() / name)
+    patch.setattr(demo_film, 'film', lambda *given: seen.append(given))
     patch.setattr(demo, 'drive_by_hand', lambda settings: seen.append('by hand'))
     watch_robot(patch, seen)
 
@@ -47,7 +50,7 @@ def watch_robot(patch: pytest.MonkeyPatch, seen: Seen) -> None:
         return {arm: [outcome] * len(drives) for arm in arms}
 
     patch.setattr(drive, 'drive_policies', note)
-    patch.setattr(demo_robot, '_draw', lambda *_: None)
+    patch.setattr(demo_report, 'draw', lambda *_: None)
 
 
 NO_PARAMETER = 'policy_node has no such parameter'
@@ -106,6 +109,7 @@ DEMO = Walk(
         'steps': 3,
         'seed': 1,
         'timeout_s': 7.0,
+        'film': Proof('film.gif', {'robot': 'ant'}),
         'view': True,
     },
     watch_graph,

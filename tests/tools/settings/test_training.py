@@ -71,6 +71,7 @@ def goals(place: str, **given: str) -> dict[str, Proof]:
 
 
 GCIQL = {'agent': 'gciql'}
+CRL = {'agent': 'crl'}
 SAW = {'agent': 'saw'}
 GEOMETRIC = {'gcbc.goals.actor.geometric': True}
 PRETRAIN = Walk(
@@ -110,6 +111,14 @@ PRETRAIN = Walk(
         'gciql.alpha': Proof(3.0, GCIQL),
         'gciql.expectile': Proof(0.6, GCIQL),
         'gciql.tau': Proof(0.5, GCIQL),
+        'crl.const_std': Proof(False, CRL),
+        'crl.discount': Proof(0.5, CRL),
+        **goals('crl.goals.value', **CRL),
+        **goals('crl.goals.actor', **CRL),
+        'crl.goals.gc_negative': Proof(False, refused='goals.gc_negative has no effect on it'),
+        'crl.actor_loss': Proof('awr', CRL),
+        'crl.alpha': Proof(3.0, CRL),
+        'crl.latent_dim': Proof(4, CRL),
         'saw.const_std': Proof(False, SAW),
         'saw.discount': Proof(0.5, SAW),
         **goals('saw.goals.value', **SAW),

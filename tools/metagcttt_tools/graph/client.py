@@ -1,6 +1,6 @@
 """A program's view of the robot: put it at a task's start, publish a goal, watch what happens."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 import time
@@ -27,6 +27,7 @@ class GoalOutcome:
         success: Whether the goal was reached.
         steps: Control steps from the goal's acceptance to its end.
         path: (x, y) in metres at each step.
+        observations: What the robot observed at each step.
         goal: (x, y) of the goal in metres.
         report: The adaptation to this goal.
     """
@@ -34,6 +35,7 @@ class GoalOutcome:
     success: bool
     steps: int
     path: list[tuple[float, float]]
+    observations: list[Sequence[float]]
     goal: tuple[float, float]
     report: AdaptationReport
 
@@ -128,11 +130,12 @@ class MazeClient(RobotCommander):
             'the last state',
             timeout_s,
         )
-        states = self._states(answer.episode_id)
+        states = [s for s in self._states(answer.episode_id) if s.step <= end.step]
         return GoalOutcome(
             success=end.kind == EpisodeEvent.REACHED,
             steps=end.step - accepted.step,
-            path=[(s.position.x, s.position.y) for s in states if s.step <= end.step],
+            path=[(s.position.x, s.position.y) for s in states],
+            observations=[s.observation for s in states],
             goal=(answer.goal_position.x, answer.goal_position.y),
             report=next(r for r in self._seen.reports if r.query_id == accepted.query_id),
         )
