@@ -180,16 +180,6 @@ def load_checkpoint(
                 f'{folder}: weight {name} has shape {tuple(saved[name].shape)}, '
                 f'the settings ask for {tuple(tensor.shape)}'
             )
-<<<<<<< HEAD
-=======
-        if saved[name].dtype not in (tensor.dtype, torch.float16):
-            raise CheckpointError(
-                f'{folder}: weight {name} is {saved[name].dtype}, expected {tensor.dtype} or '
-                'float16'
-            )
-        if not torch.isfinite(saved[name]).all():
-            raise CheckpointError(f'{folder}: weight {name} holds a non-finite value')
->>>>>>> ant
     agent = agent_type(index.obs_dim, index.act_dim, settings, torch.Generator())
     if index.scaling is not None:
         try:
@@ -305,8 +295,10 @@ def _check_tensor(folder: Path, name: str, tensor: Tensor) -> None:
     what = name if weight == name else f'weight {weight}'
     if weight == name and not re.fullmatch(_OPTIMIZER_TENSOR, name):
         raise CheckpointError(f'{folder}: unknown tensor {name}')
-    if tensor.dtype != torch.float32:
-        raise CheckpointError(f'{folder}: {what} is {tensor.dtype}, expected {torch.float32}')
+    half = weight != name and tensor.dtype == torch.float16
+    if not (half or tensor.dtype == torch.float32):
+        expected = 'float32' if weight == name else 'float32 or float16'
+        raise CheckpointError(f'{folder}: {what} is {tensor.dtype}, expected {expected}')
     if not torch.isfinite(tensor).all():
         raise CheckpointError(f'{folder}: {what} holds a non-finite value')
     if name.endswith(_NEVER_NEGATIVE) and (tensor < 0).any():
