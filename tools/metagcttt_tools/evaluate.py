@@ -27,6 +27,7 @@ from tqdm import tqdm
 
 from metagcttt_tools import evaluate_offline
 from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.environment import environment_of
 from metagcttt_tools.common.job_log import JobLog
 from metagcttt_tools.common.results import markdown_table, start_column
 from metagcttt_tools.common.resume import kept_in, Resumable
@@ -139,7 +140,9 @@ def evaluate(
     Raises:
         ValueError: If data or policies are not those of the fingerprints.
     """
-    environments = [environment_of(path) for path in settings.checkpoints]
+    from metagcttt_core import load_checkpoint
+
+    environments = [environment_of(load_checkpoint(path)) for path in settings.checkpoints]
     num_tasks = make_simulator(environments[0], standing=settings.standing).spec.num_tasks
     jobs = [
         (str(path), environment, budget, seed, task)
@@ -291,20 +294,6 @@ def _run_jobs(
             pool.shutdown(cancel_futures=True)
     log.close()
     return log.finished
-
-
-def environment_of(checkpoint: Path) -> str:
-    """The environment that a policy is for.
-
-    Raises:
-        CheckpointError: If it is damaged or does not say so.
-    """
-    from metagcttt_core import CheckpointError, load_checkpoint
-
-    environment = load_checkpoint(checkpoint).metadata.get('environment')
-    if environment is None:
-        raise CheckpointError(f'{checkpoint}: does not say which environment it is for')
-    return environment
 
 
 class _Worker:

@@ -78,7 +78,7 @@ def test_post_training_continues_by_its_folder_alone(data, tmp_path):
     [
         (['--seed', '4'], 'cannot resume, seed was 0 and is now 4'),
         (['--training.lr', '0.1'], 'cannot resume, training.lr was 0.0003 and is now 0.1'),
-        (['--environment', 'antmaze-medium-v0'], "environment was 'pointmaze-medium-v0' and is"),
+        (['--environment', 'antmaze-medium-v0'], "environment was None and is now 'ant"),
         (['--training.steps', '5'], 'training.steps was 6 and is now 5: a run can be extended'),
     ],
 )

@@ -111,6 +111,22 @@ def test_lists_times_of_any_unit_and_limits_of_the_data(tmp_path, capsys):
     assert f'{file}: u is 300 in row 0, beyond -1 to 1: give low and high' in error
 
 
+def test_commands_with_a_reach_lead_what_is_measured(tmp_path, capsys):
+    lead = MAP.replace('low: -0.5, high: 1.5', 'measured: y, reach: 2')
+    assert lead != MAP
+    content = table(y=[9.0] * 7, v=[8.0, 9.0, 10.0, 11.0, 7.0, 9.0, 9.0])
+    file = write(tmp_path, content)
+    assert convert(tmp_path, file, columns=lead).actions[:4, 0].tolist() == [-0.5, 0, 0.5, 1]
+    nearer = lead.replace('reach: 2', 'reach: 1')
+    error = complaint(capsys, tmp_path, file, columns=nearer)
+    assert 'v less its measured value is 2 in row 3, beyond -1 to 1' in error
+    nobody = lead.replace('measured: y', 'measured: z')
+    error = complaint(capsys, tmp_path, file, columns=nobody)
+    assert 'no observed value is named z (there are: ' in error
+    error = complaint(capsys, tmp_path, file, columns=lead.replace(', reach: 2', ''))
+    assert 'give measured and reach, or neither' in error
+
+
 @pytest.mark.parametrize(
     ('changes', 'error'),
     [
