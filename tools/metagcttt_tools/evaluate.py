@@ -32,6 +32,7 @@ from metagcttt_tools.common.job_log import JobLog
 from metagcttt_tools.common.results import markdown_table, start_column
 from metagcttt_tools.common.resume import kept_in, Resumable
 from metagcttt_tools.common.session import provenance, sole_writer, use_threads
+from metagcttt_tools.common.sources import identities
 
 _DESCRIPTION = """Success of policies by test-time training budget.
 
@@ -108,12 +109,13 @@ def main(argv: list[str] | None = None) -> None:
     settings = parse(EvaluateSettings, _DESCRIPTION, 'evaluate', arguments)
     try:
         with sole_writer(settings.out, settings.out):
-            marks = fingerprints(settings.dataset, settings.checkpoints)
+            known = identities(settings.dataset, settings.checkpoints)
+            marks = known['fingerprints']
             done = finished_before(settings, marks)
             results = done['results'] if done else evaluate(settings, settings, marks)
             if not done:
                 report = {'settings': settings.model_dump(mode='json'), **provenance()}
-                write_json(settings.out, {**report, 'fingerprints': marks, 'results': results})
+                write_json(settings.out, {**report, **known, 'results': results})
                 finished_jobs(settings.out).unlink()
     except ValueError as error:
         fail(str(error))
@@ -134,7 +136,7 @@ def evaluate(
     Args:
         settings: What to evaluate.
         program: The settings to continue with after an interruption.
-        fingerprints: Of the data and policies, see `fingerprints`; what finishes is kept in
+        fingerprints: Of the data and policies, see `sources`; what finishes is kept in
             `finished_jobs` until the caller has kept the results.
 
     Raises:
@@ -214,14 +216,6 @@ def format_table(results: list[dict[str, Any]], standing: bool = False) -> str:
 def finished_jobs(out: Path) -> Path:
     """The log of the jobs that an evaluation has finished, while it is under way."""
     return out.with_suffix('.partial.jsonl')
-
-
-def fingerprints(dataset: Path, checkpoints: Sequence[Path]) -> dict[str, Any]:
-    """Hashes of the dataset and of the policies."""
-    from metagcttt_core import load_checkpoint
-
-    policies = [load_checkpoint(path).fingerprint() for path in checkpoints]
-    return {'dataset': TrajectoryDataset.load(dataset).fingerprint, 'policies': policies}
 
 
 def finished_before(

@@ -18,6 +18,7 @@ from pydantic import Field, model_validator
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.results import markdown_table
 from metagcttt_tools.common.session import provenance
+from metagcttt_tools.common.sources import identities
 
 if TYPE_CHECKING:
     from metagcttt_tools.graph.robot import RobotOutcome
@@ -143,7 +144,13 @@ def main(argv: list[str] | None = None) -> None:
         for checkpoint in settings.checkpoints
         for budget in settings.budgets
     ]
-    report = {'settings': settings.model_dump(mode='json'), **provenance(), 'results': results}
+    policies = list(dict.fromkeys(path for path, _ in arms.values()))
+    report = {
+        'settings': settings.model_dump(mode='json'),
+        **provenance(),
+        **identities(settings.dataset, policies),
+        'results': results,
+    }
     write_json(settings.out, report)
     print(format_table(results))
     print(f'results: {settings.out}')

@@ -16,10 +16,10 @@ from sim_bridge import make_simulator
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.environment import environment_of
 from metagcttt_tools.common.session import provenance, sole_writer
+from metagcttt_tools.common.sources import fingerprints
 from metagcttt_tools.evaluate import (
     check_fingerprints,
     EpisodeSettings,
-    fingerprints,
     format_table,
     success_curve,
     success_point,

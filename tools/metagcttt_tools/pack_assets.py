@@ -1,12 +1,9 @@
 """Pack trained policies and part of their dataset into the small assets that the demo uses."""
 
-import json
 from pathlib import Path
-from typing import Any
 
 from metagcttt_core import DatasetError, TrajectoryDataset
 from metagcttt_core.config import Settings
-from metagcttt_core.data.dataset import CONTRACT
 from metagcttt_core.files import atomic_write
 import numpy as np
 from pydantic import Field
@@ -65,14 +62,11 @@ def main(argv: list[str] | None = None) -> None:
 
 def pack_dataset(dataset: TrajectoryDataset, settings: PackSettings) -> None:
     """Write the first trajectories of `dataset` to `dataset.npz`."""
-    about: dict[str, Any] = {}
-    if dataset.contract:
-        about[CONTRACT] = np.array(json.dumps(dataset.contract))
     rows = int(dataset.episode_ends[min(settings.episodes, dataset.num_episodes) - 1]) + 1
     with atomic_write(settings.out / _DATASET) as file:
         np.savez_compressed(
             file,
-            **about,
+            **dataset.about,
             observations=dataset.observations[:rows].astype(np.float16),
             actions=dataset.actions[:rows].astype(np.float16),
             terminals=dataset.terminals[:rows],

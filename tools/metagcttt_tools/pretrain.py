@@ -184,7 +184,7 @@ def _run(settings: PretrainSettings) -> None:
     agent.metadata = {
         **({'environment': environment} if environment else {}),
         **({'contract': dataset.contract} if dataset.contract else {}),
-        'history': [history_entry('pretrain', settings, decisive)],
+        'history': [history_entry('pretrain', settings, decisive, dataset.made_from)],
     }
     held_out = validation_data(settings.dataset, dataset)
     validation = Validation(held_out, settings.training.batch_size, precision)

@@ -57,6 +57,8 @@ def test_drive_becomes_a_trajectory(contract_file, tmp_path, storage, compressio
     bag = write(tmp_path / 'bag', drive(), storage, compression)
     dataset = convert(contract_file, bag)
     assert (dataset.num_episodes, dataset.num_transitions) == (1, 19)
+    assert [each['name'] for each in dataset.made_from['sources']] == ['cart.yaml', 'bag']
+    assert dataset.made_from['sources'][1]['bytes'] == sum(f.stat().st_size for f in bag.iterdir())
     steps = np.arange(20)
     np.testing.assert_allclose(dataset.observations[:, 0], 0.05 * steps, atol=1e-6)
     assert (dataset.observations[:, 1] == 0).all()  # the origin is taken off
