@@ -35,7 +35,7 @@ class Limits:
         self.high = np.concatenate([high for _, high in limits])
         self.max_rates = np.concatenate([value.max_rates for value in topic.values])
         names = chain.from_iterable(
-            measured_columns(value) or [None] * value.num_values for value in topic.values
+            measured_columns(value) or [''] * value.num_values for value in topic.values
         )
         self._sources = [(i, contract.columns.index(name)) for i, name in enumerate(names) if name]
         self._reaches = np.concatenate(

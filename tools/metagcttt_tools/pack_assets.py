@@ -4,7 +4,7 @@ from pathlib import Path
 
 from metagcttt_core import DatasetError, TrajectoryDataset
 from metagcttt_core.config import Settings
-from metagcttt_core.files import atomic_write
+from metagcttt_core.data.npz import write_arrays
 import numpy as np
 from pydantic import Field
 
@@ -63,11 +63,12 @@ def main(argv: list[str] | None = None) -> None:
 def pack_dataset(dataset: TrajectoryDataset, settings: PackSettings) -> None:
     """Write the first trajectories of `dataset` to `dataset.npz`."""
     rows = int(dataset.episode_ends[min(settings.episodes, dataset.num_episodes) - 1]) + 1
-    with atomic_write(settings.out / _DATASET) as file:
-        np.savez_compressed(
-            file,
+    write_arrays(
+        settings.out / _DATASET,
+        {
             **dataset.about,
-            observations=dataset.observations[:rows].astype(np.float16),
-            actions=dataset.actions[:rows].astype(np.float16),
-            terminals=dataset.terminals[:rows],
-        )
+            'observations': dataset.observations[:rows].astype(np.float16),
+            'actions': dataset.actions[:rows].astype(np.float16),
+            'terminals': dataset.terminals[:rows],
+        },
+    )

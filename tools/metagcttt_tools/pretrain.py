@@ -83,6 +83,11 @@ class PretrainSettings(RunSettings):
         """Steps of the whole run."""
         return self.training.steps
 
+    @property
+    def maze(self) -> str:
+        """The simulator of a policy that is of no robot's contract."""
+        return self.environment or _USUAL_ENVIRONMENT
+
     def environment_for(self, contract: Mapping[str, Any] | None) -> str | None:
         """The simulator of the policy; none for data of a robot.
 
@@ -93,7 +98,7 @@ class PretrainSettings(RunSettings):
             DatasetError: If a simulator is asked for that the robot does not have.
         """
         if not contract:
-            return self.environment or _USUAL_ENVIRONMENT
+            return self.maze
         if asked := [n for n in ('environment', 'evaluate_every') if getattr(self, n) is not None]:
             raise DatasetError(
                 f'{self.dataset}: of the robot {contract["robot"]}, which is in no maze: leave '

@@ -12,6 +12,7 @@ from metagcttt_core.training.checkpoint import steps_done
 from metagcttt_tools import evaluate, generate, meta_train, pretrain
 from metagcttt_tools.common.resume import flat, nested
 from metagcttt_tools.common.session import sole_writer
+from metagcttt_tools.common.sources import fingerprints
 import pytest
 from tests.core.builders import assert_bit_equal, maze_walks, weights_of
 
@@ -203,7 +204,7 @@ def test_second_writer_is_refused_while_the_first_lives(data, tmp_path, capsys):
 def test_policy_that_is_replaced_while_it_is_evaluated_is_refused(data, tmp_path):
     base = pretrained(data, tmp_path / 'base') / 'checkpoint'
     settings = evaluate.EvaluateSettings(checkpoints=(base,), dataset=data, episodes=1)
-    evaluate._start_worker(settings, evaluate.fingerprints(data, [base]))
+    evaluate._start_worker(settings, fingerprints(data, [base]))
     job = (str(base), 'pointmaze-medium-v0', 0, 0, 1)
     assert evaluate._outcome(job)[0] in (0, 1)
     other = load_checkpoint(pretrained(data, tmp_path / 'other', seed=1) / 'checkpoint')
