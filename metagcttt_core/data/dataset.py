@@ -15,6 +15,8 @@ from metagcttt_core.data.errors import DatasetError
 _CHUNK_ROWS = 1 << 20
 CONTRACT = 'contract'
 """Name of the text in an npz file that holds the contract as JSON."""
+MADE_FROM = 'made_from'
+"""Name of the text in an npz file that says as JSON what the dataset was made from."""
 
 
 class TrajectoryDataset:
@@ -41,6 +43,8 @@ class TrajectoryDataset:
         origin: (obs_dim,) float64; zeros but for values such as UTM coordinates, which are so
             large that float32 would round their changes away.
         contract: The robot's contract that the rows satisfy (`Contract.identity`), if any.
+        made_from: The program that made it and the files that it read, by name and content, if
+            that was recorded; it decides nothing, and `fingerprint` does not count it.
     """
 
     def __init__(
@@ -62,6 +66,7 @@ class TrajectoryDataset:
         self.source = source
         self.origin = np.zeros(observations.shape[1]) if origin is None else origin
         self.contract = dict(contract) if contract else None
+        self.made_from: dict[str, Any] | None = None
         self.episode_ends = np.flatnonzero(terminals).astype(np.int64)
         self.episode_starts = np.concatenate([[0], self.episode_ends[:-1] + 1]).astype(np.int64)
         lengths = np.diff(self.episode_ends, prepend=-1)
@@ -159,10 +164,13 @@ class TrajectoryDataset:
             if checks.is_following(name)
             and (name == 'next_observations' or arrays[name].shape == shape)
         }
-        contract = None if minari.is_minari(path) else npz.read_json(path, CONTRACT)
+        contract = made_from = None
+        if not minari.is_minari(path):
+            contract, made_from = (npz.read_json(path, name) for name in (CONTRACT, MADE_FROM))
         dataset = cls.from_arrays(
             observations, actions, ends, arrays, source=path, contract=contract
         )
+        dataset.made_from = made_from
         for name, states in following.items():
             states = states - dataset.origin if dataset.origin.any() else states
             checks.following_rows(dataset.observations, states, ends, name, str(path))
@@ -170,17 +178,22 @@ class TrajectoryDataset:
 
     def save(self, path: str | Path) -> None:
         """Write the dataset as OGBench's compressed npz, atomically; the inverse of `load`."""
-        about = {CONTRACT: np.array(json.dumps(self.contract))} if self.contract else {}
         npz.write_arrays(
             Path(path),
             {
-                **about,
+                **self.about,
                 'observations': self.states(slice(None)),
                 'actions': self.actions,
                 'terminals': self.terminals,
                 **self.extras,
             },
         )
+
+    @property
+    def about(self) -> dict[str, np.ndarray]:
+        """What files keep beside the rows: texts by name, each a JSON object."""
+        texts = {CONTRACT: self.contract, MADE_FROM: self.made_from}
+        return {name: np.array(json.dumps(text)) for name, text in texts.items() if text}
 
     def states(self, rows: int | slice | np.ndarray) -> np.ndarray:
         """The observations of rows as a robot gives them: float32, or float64 with an origin."""

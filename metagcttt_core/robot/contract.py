@@ -159,7 +159,11 @@ class ObservedTopic(Settings):
 
 
 class CommandValue(Numbers):
-    """Numbers of a message that a policy commands; its actions -1 to 1 become `low` to `high`."""
+    """Numbers of a message that a policy commands.
+
+    Its actions -1 to 1 become `low` to `high`, or with `reach` the measured value less or plus
+    that, within `low` to `high`.
+    """
 
     low: PerValue = Field(description='lowest command, in units of the message; or one a value')
     high: PerValue = Field(description='highest command, in units of the message; or one a value')
@@ -171,10 +175,16 @@ class CommandValue(Numbers):
         description='observed field of the same joints from which the first command starts, such '
         'as position; empty: the first command starts from zero',
     )
+    reach: PerValue | None = Field(
+        None,
+        description='farthest command from the measured value, in units of the message; or one a '
+        'value. Actions are then distances from where the joints are, which targets of positions '
+        'that lead a moving joint want; absent: actions are commands between low and high',
+    )
 
     @model_validator(mode='after')
     def _check_limits(self) -> Self:
-        for name in ('low', 'high', 'max_rate'):
+        for name in ('low', 'high', 'max_rate', 'reach'):
             given = getattr(self, name)
             if given is not None and len(given) not in (1, self.num_values):
                 raise ValueError(f'{name} needs 1 or {self.num_values} numbers, got {len(given)}')
@@ -184,6 +194,10 @@ class CommandValue(Numbers):
             raise ValueError('max_rate must be positive')
         if self.measured and not self.joints:
             raise ValueError('measured takes joints')
+        if self.reach is not None and not self.measured:
+            raise ValueError('reach needs measured: the observed field that it counts from')
+        if self.reach is not None and min(self.reach) <= 0:
+            raise ValueError('reach must be positive')
         return self
 
     @property
@@ -195,6 +209,11 @@ class CommandValue(Numbers):
     def max_rates(self) -> tuple[float, ...]:
         """The fastest changes per second value by value, infinite where there is no limit."""
         return self._each(self.max_rate or (float('inf'),))
+
+    @property
+    def reaches(self) -> tuple[float, ...] | None:
+        """The farthest commands from the measured values value by value, if actions are such."""
+        return self._each(self.reach) if self.reach else None
 
     def _each(self, given: tuple[float, ...]) -> tuple[float, ...]:
         return given * self.num_values if len(given) == 1 else given
@@ -331,15 +350,26 @@ class Contract(Settings):
             raise ValueError(
                 f'several observed values are named {", ".join(repeated)}: give them a name'
             )
-        wanted = chain(
-            self.position or (),
-            self.retrieval.values if self.retrieval else (),
-            *(measured_columns(value) for topic in self.act for value in topic.values),
-        )
+        measured = [
+            name
+            for topic in self.act
+            for value in topic.values
+            for name in measured_columns(value)
+        ]
+        retrieved = self.retrieval.values if self.retrieval else ()
+        wanted = [*(self.position or ()), *retrieved, *measured]
         if unknown := [name for name in wanted if name not in self.columns]:
             raise ValueError(
                 f'no observed value is named {unknown[0]} (there are: {", ".join(self.columns)})'
             )
+        for value in (value for topic in self.observe for value in topic.values):
+            if (value.scale, value.clamp, value.transform) == (1.0, None, 'none'):
+                continue
+            if changed := set(value.columns).intersection(measured):
+                raise ValueError(
+                    f'{min(changed)} is measured for commands: it takes no scale, clamp or '
+                    'transform'
+                )
         for topic in self.act:
             if topic.timeout_s < 1.0 / self.rate_hz:
                 raise ValueError(
@@ -394,10 +424,14 @@ class Contract(Settings):
         ]
         commanded = [
             {'name': f'{joint}.{value.field}' if joint else value.field, 'low': low, 'high': high}
+            | ({'reach': reach, 'from': f'{joint}.{value.measured}'} if reach else {})
             for topic in self.act
             for value in topic.values
-            for joint, low, high in zip(
-                value.joints or [''] * value.num_values, *value.limits, strict=True
+            for joint, low, high, reach in zip(
+                value.joints or [''] * value.num_values,
+                *value.limits,
+                value.reaches or [None] * value.num_values,
+                strict=True,
             )
         ]
         meaning = {
@@ -461,7 +495,7 @@ class Contract(Settings):
 
 
 def measured_columns(value: CommandValue) -> list[str]:
-    """The observed values from which the first command of a field starts; empty: from zero."""
+    """The observed values that commands of a field are measured against; empty: there are none."""
     return [f'{joint}.{value.measured}' for joint in value.joints] if value.measured else []
 
 

@@ -70,6 +70,26 @@ def test_pretrain_writes_checkpoint_logs_and_settings(base):
     assert list((base.parent / 'tensorboard').iterdir())
 
 
+def test_policy_of_a_robot_is_for_no_maze(tmp_path, capsys):
+    data, walks = tmp_path / 'robot.npz', maze_walks()
+    walks.contract = contract().identity
+    walks.made_from = {'program': 'import-bags', 'sources': [{'name': 'drive.mcap'}]}
+    walks.save(data)
+    pretrain.main(pretrain_arguments(data, tmp_path / 'policy', steps=1))
+    metadata = load_checkpoint(tmp_path / 'policy' / 'checkpoint').metadata
+    assert metadata['contract'] == contract().identity
+    assert 'environment' not in metadata
+    assert metadata['history'][0]['environment'] is None
+    assert metadata['history'][0]['made_from'] == walks.made_from
+    for flag, value in (('--environment', 'pointmaze-medium-v0'), ('--evaluate-every', '1')):
+        with pytest.raises(SystemExit, match='2'):
+            pretrain.main([*pretrain_arguments(data, tmp_path / 'no', steps=1), flag, value])
+        assert (
+            f'of the robot cart, which is in no maze: leave out {flag[2:].replace("-", "_")}'
+            in (capsys.readouterr().err)
+        )
+
+
 def test_pretrain_does_not_overwrite_a_checkpoint(dataset_path, base, capsys):
     with pytest.raises(SystemExit, match='2'):
         pretrain.main(pretrain_arguments(dataset_path, base.parent, steps=20))

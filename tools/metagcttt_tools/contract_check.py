@@ -70,11 +70,15 @@ def describe(contract: Contract) -> str:
         for column in value.columns
     ]
     commanded = [
-        [topic.topic, f'{value.field}{f" of {joint}" if joint else ""}', low, high, rate]
+        [topic.topic, f'{value.field}{f" of {joint}" if joint else ""}', *numbers]
         for topic in contract.act
         for value in topic.values
-        for joint, low, high, rate in zip(
-            value.joints or [''] * value.num_values, *value.limits, value.max_rates, strict=True
+        for joint, *numbers in zip(
+            value.joints or [''] * value.num_values,
+            *value.limits,
+            value.max_rates,
+            value.reaches or [''] * value.num_values,
+            strict=True,
         )
     ]
     return '\n'.join(
@@ -84,7 +88,7 @@ def describe(contract: Contract) -> str:
             '',
             tabulate(observed, ['observed', 'topic', 'field', 'stamp, time-out']),
             '',
-            tabulate(commanded, ['topic', 'commanded', 'low', 'high', 'per second']),
+            tabulate(commanded, ['topic', 'commanded', 'low', 'high', 'per second', 'reach']),
             '',
             *(
                 f'{topic.topic} without a command: '

@@ -14,6 +14,7 @@ from sim_bridge import make_simulator
 from tqdm import tqdm
 
 from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.environment import environment_of
 from metagcttt_tools.common.results import beside, markdown_table, start_column, write_report
 from metagcttt_tools.common.session import sole_writer, use_threads
 
@@ -66,7 +67,7 @@ def _run(settings: DrawSettings, record: Path, picture: Path) -> None:
     agent = load_checkpoint(settings.checkpoint)
     dataset = TrajectoryDataset.load(settings.dataset)
     trajectory_filter = TrajectoryFilter(dataset, settings.filter)
-    environment = str(agent.metadata['environment'])
+    environment = environment_of(agent)
     with make_simulator(environment, standing=settings.standing) as simulator:
         tasks = [task.task_id for task in simulator.tasks]
         goals = [simulator.reset(task, settings.seed)[1] for task in tasks]

@@ -27,10 +27,12 @@ from tqdm import tqdm
 
 from metagcttt_tools import evaluate_offline
 from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.environment import environment_of
 from metagcttt_tools.common.job_log import JobLog
 from metagcttt_tools.common.results import markdown_table, start_column
 from metagcttt_tools.common.resume import kept_in, Resumable
 from metagcttt_tools.common.session import provenance, sole_writer, use_threads
+from metagcttt_tools.common.sources import identities
 
 _DESCRIPTION = """Success of policies by test-time training budget.
 
@@ -107,12 +109,13 @@ def main(argv: list[str] | None = None) -> None:
     settings = parse(EvaluateSettings, _DESCRIPTION, 'evaluate', arguments)
     try:
         with sole_writer(settings.out, settings.out):
-            marks = fingerprints(settings.dataset, settings.checkpoints, settings.actor_loss)
+            known = identities(settings.dataset, settings.checkpoints, settings.actor_loss)
+            marks = known['fingerprints']
             done = finished_before(settings, marks)
             results = done['results'] if done else evaluate(settings, settings, marks)
             if not done:
                 report = {'settings': settings.model_dump(mode='json'), **provenance()}
-                write_json(settings.out, {**report, 'fingerprints': marks, 'results': results})
+                write_json(settings.out, {**report, **known, 'results': results})
                 finished_jobs(settings.out).unlink()
     except ValueError as error:
         fail(str(error))
@@ -133,13 +136,15 @@ def evaluate(
     Args:
         settings: What to evaluate.
         program: The settings to continue with after an interruption.
-        fingerprints: Of the data and policies, see `fingerprints`; what finishes is kept in
+        fingerprints: Of the data and policies, see `sources`; what finishes is kept in
             `finished_jobs` until the caller has kept the results.
 
     Raises:
         ValueError: If data or policies are not those of the fingerprints.
     """
-    environments = [environment_of(path) for path in settings.checkpoints]
+    from metagcttt_core import load_checkpoint
+
+    environments = [environment_of(load_checkpoint(path)) for path in settings.checkpoints]
     num_tasks = make_simulator(environments[0], standing=settings.standing).spec.num_tasks
     jobs = [
         (str(path), environment, budget, seed, task)
@@ -213,17 +218,6 @@ def finished_jobs(out: Path) -> Path:
     return out.with_suffix('.partial.jsonl')
 
 
-def fingerprints(
-    dataset: Path, checkpoints: Sequence[Path], actor_loss: ActorLoss | None = None
-) -> dict[str, Any]:
-    """Hashes of the dataset and of the policies, as they are adapted."""
-    from metagcttt_core import load_checkpoint
-
-    changes = {'actor_loss': actor_loss} if actor_loss else {}
-    policies = [load_checkpoint(path, changes=changes).fingerprint() for path in checkpoints]
-    return {'dataset': TrajectoryDataset.load(dataset).fingerprint, 'policies': policies}
-
-
 def finished_before(
     program: ProtocolSettings, fingerprints: Mapping[str, Any]
 ) -> dict[str, Any] | None:
@@ -294,20 +288,6 @@ def _run_jobs(
             pool.shutdown(cancel_futures=True)
     log.close()
     return log.finished
-
-
-def environment_of(checkpoint: Path) -> str:
-    """The environment that a policy is for.
-
-    Raises:
-        CheckpointError: If it is damaged or does not say so.
-    """
-    from metagcttt_core import CheckpointError, load_checkpoint
-
-    environment = load_checkpoint(checkpoint).metadata.get('environment')
-    if environment is None:
-        raise CheckpointError(f'{checkpoint}: does not say which environment it is for')
-    return environment
 
 
 class _Worker:

@@ -25,6 +25,7 @@ from tqdm import tqdm
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.results import markdown_table
 from metagcttt_tools.common.session import provenance, sole_writer, use_threads
+from metagcttt_tools.common.sources import identities
 
 if TYPE_CHECKING:
     from metagcttt_core.evaluation.offline import Outcome, Query
@@ -131,6 +132,7 @@ def main(argv: list[str] | None = None) -> None:
             report = {
                 'settings': settings.model_dump(mode='json'),
                 **provenance(),
+                **identities(settings.dataset, settings.checkpoints),
                 'held_out': source,
                 'results': results,
             }

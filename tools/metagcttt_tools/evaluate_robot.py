@@ -18,7 +18,8 @@ from pydantic import Field, model_validator
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.results import markdown_table
 from metagcttt_tools.common.session import provenance, sole_writer
-from metagcttt_tools.evaluate import check_fingerprints, fingerprints
+from metagcttt_tools.common.sources import fingerprints, identities
+from metagcttt_tools.evaluate import check_fingerprints
 
 if TYPE_CHECKING:
     from metagcttt_tools.graph.robot import RobotOutcome
@@ -129,13 +130,13 @@ def main(argv: list[str] | None = None) -> None:
     try:
         robot_of(settings)  # before anything is written
         with sole_writer(settings.out, settings.out):
-            marks = fingerprints(settings.dataset, policies)
+            known = identities(settings.dataset, policies)
             outcomes = drive_robot(settings, arms, settings.out.parent / 'logs')
             now = fingerprints(settings.dataset, policies)
-            check_fingerprints(policies[0], {'fingerprints': marks}, now)
+            check_fingerprints(policies[0], known, now)
             results = _results(settings, outcomes)
-            report = {'settings': settings.model_dump(mode='json'), **provenance()}
-            write_json(settings.out, {**report, 'fingerprints': marks, 'results': results})
+            report = {'settings': settings.model_dump(mode='json'), **provenance(), **known}
+            write_json(settings.out, {**report, 'results': results})
     except (NodeFailedError, NoAnswerError, ValueError, FileExistsError) as error:
         fail(*str(error).splitlines())
     except KeyboardInterrupt:

@@ -14,12 +14,12 @@ from pydantic import Field, model_validator
 from sim_bridge import make_simulator
 
 from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.environment import environment_of
 from metagcttt_tools.common.session import provenance, sole_writer
+from metagcttt_tools.common.sources import fingerprints
 from metagcttt_tools.evaluate import (
     check_fingerprints,
-    environment_of,
     EpisodeSettings,
-    fingerprints,
     format_table,
     success_curve,
     success_point,
@@ -125,12 +125,13 @@ def evaluate_ros(settings: EvaluateRosSettings) -> list[dict[str, Any]]:
         NodeFailedError: If a node ends; with its log.
         NoAnswerError: If a node does not answer in time.
     """
+    from metagcttt_core import load_checkpoint
     from metagcttt_core.evaluation.rollout import episode_seed
 
     from metagcttt_tools.graph.client import MazeClient
     from metagcttt_tools.graph.drive import drive_arms
 
-    environments = {environment_of(path) for path in settings.checkpoints}
+    environments = {environment_of(load_checkpoint(path)) for path in settings.checkpoints}
     if len(environments) > 1:
         raise ValueError(f'checkpoints for one environment at a time, got {sorted(environments)}')
     environment = environments.pop()

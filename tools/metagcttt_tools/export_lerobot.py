@@ -12,7 +12,7 @@ from metagcttt_core import TrajectoryDataset
 from metagcttt_core.config import Settings
 from metagcttt_core.data import DatasetError
 from metagcttt_core.robot import Contract, ContractError, load_contract
-from metagcttt_core.robot.commands import Limits
+from metagcttt_core.robot.commands import Limits, split_action
 import numpy as np
 from pydantic import Field
 import tyro
@@ -87,7 +87,7 @@ def _write(
             robot=contract.robot if contract else 'unknown',
             observed=observed,
             commanded=commanded,
-            actions=_commands(contract, dataset.actions),
+            actions=_commands(contract, dataset),
             rows_a_file=settings.rows_per_file,
         )
         part.chmod(0o755)
@@ -105,11 +105,12 @@ def _rate(contract: Contract | None) -> int:
     return round(contract.rate_hz)
 
 
-def _commands(contract: Contract | None, actions: np.ndarray) -> np.ndarray:
+def _commands(contract: Contract | None, dataset: TrajectoryDataset) -> np.ndarray:
     """Actions in units of the robot, where it is known."""
     if contract is None:
-        return np.asarray(actions)
-    limits = [Limits(topic) for topic in contract.act]
-    parts = np.split(actions, np.cumsum([len(each.low) for each in limits])[:-1], axis=1)
-    commands = zip(limits, parts, strict=True)
-    return np.hstack([each.to_command(part) for each, part in commands])
+        return np.asarray(dataset.actions)
+    parts = [
+        Limits(contract, topic).to_command(part, dataset.states(slice(None)))
+        for topic, part in zip(contract.act, split_action(contract, dataset.actions), strict=True)
+    ]
+    return np.hstack(parts)

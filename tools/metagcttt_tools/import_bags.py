@@ -11,6 +11,7 @@ from pydantic import Field
 
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.session import writes_dataset
+from metagcttt_tools.common.sources import made_by
 
 _DESCRIPTION = """Turn bags of a robot into a dataset (.npz), by its contract.
 
@@ -72,5 +73,6 @@ def _run(settings: BagSettings) -> None:
     except DatasetError as error:
         fail(str(error))
     dataset = join_datasets(datasets, contract=contract.identity)
+    dataset.made_from = made_by('import-bags', [settings.contract, *settings.bags])
     dataset.save(settings.out)
     print(f'{dataset}: {settings.out}')

@@ -14,6 +14,7 @@ import tyro
 
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.session import writes_dataset
+from metagcttt_tools.common.sources import made_by
 
 _DESCRIPTION = """Turn a LeRobotDataset v3 (parquet files) into a dataset (.npz).
 
@@ -55,7 +56,7 @@ def main(argv: list[str] | None = None) -> None:
 
 def _run(settings: LeRobotSettings) -> None:
     from metagcttt_tools.tables.columns import load_columns, map_of_contract
-    from metagcttt_tools.tables.lerobot import ACTION, DEFAULT_MAP, read_lerobot, STATE
+    from metagcttt_tools.tables.lerobot import ACTION, DEFAULT_MAP, READ, read_lerobot, STATE
 
     if settings.columns and settings.contract:
         fail('give columns or contract, not both')
@@ -78,6 +79,10 @@ def _run(settings: LeRobotSettings) -> None:
     except DatasetError as error:
         fail(str(error))
     found.dataset.contract = identity
+    described_by = [path for path in (settings.columns, settings.contract) if path]
+    found.dataset.made_from = made_by(
+        'import-lerobot', [*described_by, settings.folder], within=READ
+    )
     found.dataset.save(settings.out)
     print(f'{found.dataset}: {settings.out}')
     print('  cut where episode_index changes', *found.in_words(), sep='\n')

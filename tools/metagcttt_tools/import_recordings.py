@@ -12,6 +12,7 @@ from pydantic import Field
 
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.session import writes_dataset
+from metagcttt_tools.common.sources import made_by
 
 if TYPE_CHECKING:
     from metagcttt_tools.recordings.trajectories import RecordingSummary
@@ -52,8 +53,10 @@ def _run(settings: RecordingSettings) -> None:
         dataset, summary = read_recordings(
             settings.recordings, keep_idle=settings.keep_idle, refuse_gaps=settings.refuse_gaps
         )
-        if settings.extend is not None:
-            dataset = join_datasets([TrajectoryDataset.load(settings.extend), dataset])
+        extended = [settings.extend] if settings.extend is not None else []
+        if extended:
+            dataset = join_datasets([*map(TrajectoryDataset.load, extended), dataset])
+        dataset.made_from = made_by('import-recordings', [*extended, *settings.recordings])
     except DatasetError as error:
         fail(str(error))
     dataset.save(settings.out)

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.session import writes_dataset
+from metagcttt_tools.common.sources import made_by
 
 _DESCRIPTION = """Turn CSV or parquet files into a dataset (.npz), by a column map (YAML).
 
@@ -55,6 +56,7 @@ def _run(settings: TableSettings) -> None:
         fail(*str(error).splitlines())
     except DatasetError as error:
         fail(str(error))
+    found.dataset.made_from = made_by('import-table', [settings.columns, *settings.tables])
     found.dataset.save(settings.out)
     assert columns.cut is not None
     print(f'{found.dataset}: {settings.out}')

@@ -20,6 +20,7 @@ import tyro
 
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.names import names_of
+from metagcttt_tools.common.sources import in_words
 
 _DESCRIPTION = """Say what is in data, and draw where it has been.
 
@@ -100,7 +101,8 @@ def open_data(settings: InspectSettings) -> Opened:
         return _open_table(path, contract, settings.columns)
     dataset = TrajectoryDataset.load(path)
     rate_hz = contract.rate_hz if contract else (dataset.contract or {}).get('rate_hz')
-    return Opened(dataset, *names_of(dataset, contract), [], rate_hz)
+    remarks = [in_words(dataset.made_from)] if dataset.made_from else []
+    return Opened(dataset, *names_of(dataset, contract), remarks, rate_hz)
 
 
 def _open_bag(path: Path, contract: Contract | None) -> Opened:

@@ -17,6 +17,7 @@ from pydantic import Field
 from sim_bridge import make_simulator
 
 from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.environment import environment_of
 from metagcttt_tools.common.results import markdown_table, write_report
 from metagcttt_tools.common.run_log import METRICS
 from metagcttt_tools.common.session import use_threads
@@ -97,7 +98,7 @@ def test_time_curves(settings: LossCurvesSettings) -> Curves:
     changes = settings.model_dump(include={'actor_loss'}, exclude_none=True)
     agent = load_checkpoint(settings.checkpoint, changes=changes)
     trajectory_filter = TrajectoryFilter(TrajectoryDataset.load(settings.dataset), settings.filter)
-    with make_simulator(str(agent.metadata['environment'])) as simulator:
+    with make_simulator(environment_of(agent)) as simulator:
         observation, goal = simulator.reset(task_id=settings.task, seed=settings.seed)
     support = trajectory_filter.query(observation, goal, agent.value_fn)
     return {

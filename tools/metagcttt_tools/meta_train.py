@@ -89,7 +89,7 @@ def _run(settings: MetaTrainSettings) -> None:
     decisive |= {'dataset': dataset.fingerprint, 'checkpoint': base.fingerprint()}
     base.metadata['history'] = [
         *base.metadata.get('history', []),
-        history_entry('post_train', settings, decisive),
+        history_entry('post_train', settings, decisive, dataset.made_from),
     ]
     steps = settings.meta.outer_steps
     with training_session(settings, 'post_train', decisive, steps) as session:

@@ -1,13 +1,10 @@
 """Pack trained policies and part of their dataset into the small assets that the demo uses."""
 
-import json
 from pathlib import Path
-from typing import Any
 
 from metagcttt_core import DatasetError, TrajectoryDataset
 from metagcttt_core.config import Settings
-from metagcttt_core.data.dataset import CONTRACT
-from metagcttt_core.files import atomic_write
+from metagcttt_core.data.npz import write_arrays
 import numpy as np
 from pydantic import Field
 
@@ -66,15 +63,13 @@ def main(argv: list[str] | None = None) -> None:
 
 def pack_dataset(dataset: TrajectoryDataset, settings: PackSettings) -> None:
     """Write the first trajectories of `dataset` to `dataset.npz`."""
-    about: dict[str, Any] = {}
-    if dataset.contract:
-        about[CONTRACT] = np.array(json.dumps(dataset.contract))
     rows = int(dataset.episode_ends[min(settings.episodes, dataset.num_episodes) - 1]) + 1
-    with atomic_write(settings.out / _DATASET) as file:
-        np.savez_compressed(
-            file,
-            **about,
-            observations=dataset.observations[:rows].astype(np.float16),
-            actions=dataset.actions[:rows].astype(np.float16),
-            terminals=dataset.terminals[:rows],
-        )
+    write_arrays(
+        settings.out / _DATASET,
+        {
+            **dataset.about,
+            'observations': dataset.observations[:rows].astype(np.float16),
+            'actions': dataset.actions[:rows].astype(np.float16),
+            'terminals': dataset.terminals[:rows],
+        },
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
@@ -35,13 +36,20 @@ Writes OUT/checkpoint, OUT/metrics.jsonl and TensorBoard logs.
 Ctrl-C saves and ends; --resume, with no other flag than --out, continues."""
 
 
+_USUAL_ENVIRONMENT = 'pointmaze-medium-v0'
+
+
 class PretrainSettings(RunSettings):
     """Settings of the program."""
 
     may_change = RunSettings.may_change | {'evaluate_every', 'evaluation_episodes'}
     may_grow = frozenset({'training.steps'})
 
-    environment: str = Field('pointmaze-medium-v0', description='simulator the policy is for')
+    environment: str | None = Field(
+        None,
+        description=f'simulator the policy is for; by default {_USUAL_ENVIRONMENT}, and none for '
+        "data of a robot's contract",
+    )
     out: Path = Field(Path('out/pretrain'), description='folder of the run')
     agent: AgentName = Field('gcbc', description='kind of agent')
     hidden: tuple[int, ...] = Field((512, 512, 512), description='units of each hidden layer')
@@ -75,6 +83,29 @@ class PretrainSettings(RunSettings):
     def steps(self) -> int:
         """Steps of the whole run."""
         return self.training.steps
+
+    @property
+    def maze(self) -> str:
+        """The simulator of a policy that is of no robot's contract."""
+        return self.environment or _USUAL_ENVIRONMENT
+
+    def environment_for(self, contract: Mapping[str, Any] | None) -> str | None:
+        """The simulator of the policy; none for data of a robot.
+
+        Args:
+            contract: `Contract.identity` of the data, if they have one.
+
+        Raises:
+            DatasetError: If a simulator is asked for that the robot does not have.
+        """
+        if not contract:
+            return self.maze
+        if asked := [n for n in ('environment', 'evaluate_every') if getattr(self, n) is not None]:
+            raise DatasetError(
+                f'{self.dataset}: of the robot {contract["robot"]}, which is in no maze: leave '
+                f'out {" and ".join(asked)}'
+            )
+        return None
 
     def decisive(self) -> dict[str, Any]:
         """The settings that decide the result, without those of other agents."""
@@ -150,11 +181,16 @@ def _run(settings: PretrainSettings) -> None:
     standardise = {'auto': dataset.contract is not None, 'yes': True, 'no': False}
     agent.scaling = Scaling.of(dataset, standardise=standardise[settings.standardise])
     precision = resolve_precision(settings.precision, agent)
-    decisive = settings.decisive() | {'dataset': dataset.fingerprint, 'precision': precision}
+    environment = settings.environment_for(dataset.contract)
+    decisive = settings.decisive() | {
+        'environment': environment,
+        'dataset': dataset.fingerprint,
+        'precision': precision,
+    }
     agent.metadata = {
-        'environment': settings.environment,
+        **({'environment': environment} if environment else {}),
         **({'contract': dataset.contract} if dataset.contract else {}),
-        'history': [history_entry('pretrain', settings, decisive)],
+        'history': [history_entry('pretrain', settings, decisive, dataset.made_from)],
     }
     held_out = validation_data(settings.dataset, dataset)
     validation = Validation(held_out, settings.training.batch_size, precision)
@@ -170,9 +206,9 @@ def _run(settings: PretrainSettings) -> None:
                 scalars = as_scalars(losses) | {'speed/updates_per_s': throughput.rate()}
                 session.bar.set_postfix(loss=f'{scalars["train/loss"]:.4f}')
                 scalars |= validation.losses(agent, settings.seed, step)
-            if due(settings.evaluate_every):
+            if environment and due(settings.evaluate_every):
                 scalars |= success_rates(
-                    agent, settings.environment, settings.evaluation_episodes, settings.seed
+                    agent, environment, settings.evaluation_episodes, settings.seed
                 )
             if due(settings.snapshot_every):
                 save_checkpoint(agent, snapshot_folder(settings.out, step))

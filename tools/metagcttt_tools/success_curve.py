@@ -14,10 +14,10 @@ from pydantic import Field
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.results import markdown_table, start_column, write_report
 from metagcttt_tools.common.session import snapshot_folder, SNAPSHOTS, sole_writer
+from metagcttt_tools.common.sources import fingerprints
 from metagcttt_tools.evaluate import (
     evaluate,
     EvaluateSettings,
-    fingerprints,
     finished_before,
     finished_jobs,
     ProtocolSettings,

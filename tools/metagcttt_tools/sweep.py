@@ -30,8 +30,9 @@ from metagcttt_tools.common.session import (
     time_limit,
     use_threads,
 )
+from metagcttt_tools.common.sources import fingerprints
 from metagcttt_tools.common.stopping import stop_on_signal
-from metagcttt_tools.evaluate import EvaluateSettings, fingerprints, finished_jobs
+from metagcttt_tools.evaluate import EvaluateSettings, finished_jobs
 from metagcttt_tools.jobs.program import Invocation
 from metagcttt_tools.jobs.scheduler import Job, LocalScheduler, Resources, run_all, Scheduler
 from metagcttt_tools.meta_train import MetaTrainSettings

@@ -22,37 +22,57 @@ NOTHING_OBSERVED = np.zeros(4)
 actions = st.lists(st.floats(-1, 1), min_size=2, max_size=2)
 
 
-def commander(text=None) -> Commander:
-    whole = contract(text) if text else contract()
+LEADING = ARM.replace('max_rate: 1', 'reach: [0.5, 0.25]')
+
+
+def commander(text: str = DRIVE) -> Commander:
+    whole = contract(text)
     return Commander(whole, whole.act[0])
 
 
+def limits_of(text: str = DRIVE) -> Limits:
+    whole = contract(text)
+    return Limits(whole, whole.act[0])
+
+
+@pytest.mark.parametrize('text', [DRIVE, LEADING])
 @given(actions)
-def test_command_turns_back_into_its_action(action):
-    limits = Limits(contract().act[0])
-    command = limits.to_command(action)
+def test_command_turns_back_into_its_action(text, action):
+    limits = limits_of(text)
+    command = limits.to_command(action, NOTHING_OBSERVED)
     assert (command >= limits.low).all()
     assert (command <= limits.high).all()
-    np.testing.assert_allclose(limits.to_action(command), action, atol=1e-12)
+    np.testing.assert_allclose(limits.to_action(command, NOTHING_OBSERVED), action, atol=1e-12)
 
 
 def test_bounds_of_actions_are_the_limits():
-    limits = Limits(contract().act[0])
-    assert limits.to_command([-1, -1]).tolist() == [-0.5, -2.0]
-    assert limits.to_command([7, 1]).tolist() == [1.0, 2.0]
-    assert limits.to_action([0.25, 0.0]).tolist() == [0.0, 0.0]
+    limits = limits_of()
+    assert limits.to_command([-1, -1], NOTHING_OBSERVED).tolist() == [-0.5, -2.0]
+    assert limits.to_command([7, 1], NOTHING_OBSERVED).tolist() == [1.0, 2.0]
+    assert limits.to_action([0.25, 0.0], NOTHING_OBSERVED).tolist() == [0.0, 0.0]
+
+
+def test_commands_with_a_reach_lead_the_measured_values_within_the_limits():
+    limits = limits_of(LEADING)  # observed: a, b; commanded: b, a
+    observed = np.array([[1.0, -1.0], [1.9, -2.8]])
+    commands = limits.to_command([[1.0, -1.0], [-9.0, 1.0]], observed)
+    np.testing.assert_allclose(commands, [[-0.5, 0.75], [-3.0, 2.0]])
+    np.testing.assert_allclose(limits.to_action([-1.25, 1.125], observed[0]), [-0.5, 0.5])
+    with pytest.raises(MessageError, match=r'further than \[0.5, 0.25\] .* \[-1.0, 1.0\]'):
+        limits.to_action([-1.6, 1.0], observed[0])
 
 
 def test_recorded_command_beyond_the_limits_is_refused_and_rounding_is_not():
-    limits = Limits(contract().act[0])
-    assert limits.to_action([float(np.nextafter(np.float32(1.0), 2)), 0])[0] == 1.0
+    limits = limits_of()
+    just_above = [float(np.nextafter(np.float32(1.0), 2)), 0]
+    assert limits.to_action(just_above, NOTHING_OBSERVED)[0] == 1.0
     with pytest.raises(MessageError, match=r'commands \[1.1, 0.0\], outside the limits'):
-        limits.to_action([1.1, 0.0])
+        limits.to_action([1.1, 0.0], NOTHING_OBSERVED)
 
 
 @given(st.lists(st.tuples(actions, st.integers(1, 8 * STEP)), max_size=20))
 def test_commands_never_leave_limits_or_reach(sequence):
-    sender, limits, now, last = commander(), Limits(contract().act[0]), 0, None
+    sender, limits, now, last = commander(), limits_of(), 0, None
     for action, wait in sequence:
         now += wait
         command = sender.command(action, NOTHING_OBSERVED, now)

@@ -14,7 +14,7 @@ FILES = sorted(ROBOTS.glob('*.yaml'))
 def test_starting_contracts_load():
     dims = {file.stem: load_contract(file) for file in FILES}
     assert {name: (c.obs_dim, c.act_dim) for name, c in dims.items()} == {
-        'arm4': (8, 4),
+        'arm4': (4, 4),
         'arm6': (12, 6),
         'diffbot': (4, 2),
         'diffdrive': (6, 2),
@@ -122,6 +122,10 @@ def test_files_that_hold_no_contract_are_refused(tmp_path: Path, content, messag
         ('measured: position', 'measured: effort', 'no observed value is named b.effort'),
         ('joints: [b, a]', 'size: 2', 'measured takes joints'),
         ('high: [3, 2]', 'high: [3, 2, 1]', 'high needs 1 or 2 numbers, got 3'),
+        ('measured: position', 'reach: 0.3', 'reach needs measured'),
+        ('max_rate: 1', 'reach: 0', 'reach must be positive'),
+        ('max_rate: 1', 'reach: [1, 2, 3]', 'reach needs 1 or 2 numbers, got 3'),
+        ('[a, b]}', '[a, b], scale: 2}', 'a.position is measured for commands: it takes no scale'),
         ('fault: hold', 'fault: zeros', 'fallback fault: zeros would drive the positions of data'),
         ('[a, b]}', '[a, b], clamp: [1, 0]}', 'clamp takes a lower and a higher bound'),
         ('[a, b]}', '[a, b], scale: 0}', 'scale must not be 0'),

@@ -38,7 +38,7 @@ def test_a_robot_loads_nothing_of_the_method(module: str) -> None:
     ('robot', 'contract', 'topic', 'message_type', 'values'),
     [
         ('diffbot', 'diffbot.yaml', 'cmd_vel', TwistStamped, (4, 2)),
-        ('arm', 'arm4.yaml', 'arm_controller/commands', Float64MultiArray, (8, 4)),
+        ('arm', 'arm4.yaml', 'arm_controller/commands', Float64MultiArray, (4, 4)),
     ],
 )
 def test_a_driven_robot_is_recorded_and_becomes_a_dataset(

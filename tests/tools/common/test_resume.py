@@ -12,6 +12,7 @@ from metagcttt_core.training.checkpoint import steps_done
 from metagcttt_tools import evaluate, generate, meta_train, pretrain
 from metagcttt_tools.common.resume import flat, nested
 from metagcttt_tools.common.session import sole_writer
+from metagcttt_tools.common.sources import fingerprints
 import pytest
 from tests.core.builders import assert_bit_equal, maze_walks, weights_of
 
@@ -86,7 +87,7 @@ def test_post_training_continues_by_its_folder_alone(data, tmp_path):
     [
         (['--seed', '4'], 'cannot resume, seed was 0 and is now 4'),
         (['--training.lr', '0.1'], 'cannot resume, training.lr was 0.0003 and is now 0.1'),
-        (['--environment', 'antmaze-medium-v0'], "environment was 'pointmaze-medium-v0' and is"),
+        (['--environment', 'antmaze-medium-v0'], "environment was None and is now 'ant"),
         (['--training.steps', '5'], 'training.steps was 6 and is now 5: a run can be extended'),
     ],
 )
@@ -211,7 +212,7 @@ def test_second_writer_is_refused_while_the_first_lives(data, tmp_path, capsys):
 def test_policy_that_is_replaced_while_it_is_evaluated_is_refused(data, tmp_path):
     base = pretrained(data, tmp_path / 'base') / 'checkpoint'
     settings = evaluate.EvaluateSettings(checkpoints=(base,), dataset=data, episodes=1)
-    evaluate._start_worker(settings, evaluate.fingerprints(data, [base]))
+    evaluate._start_worker(settings, fingerprints(data, [base]))
     job = (str(base), 'pointmaze-medium-v0', 0, 0, 1)
     assert evaluate._outcome(job)[0] in (0, 1)
     other = load_checkpoint(pretrained(data, tmp_path / 'other', seed=1) / 'checkpoint')

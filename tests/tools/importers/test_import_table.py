@@ -112,6 +112,40 @@ def test_lists_times_of_any_unit_and_limits_of_the_data(tmp_path, capsys):
     assert f'{file}: u is 300 in row 0, beyond -1 to 1: give low and high' in error
 
 
+def test_dataset_says_which_files_it_was_made_from(tmp_path, capsys):
+    files = [write(tmp_path, table(), name=name) for name in ('one', 'two')]
+    made_from = convert(tmp_path, *files).made_from
+    assert made_from['program'] == 'import-table'
+    columns, one, two = made_from['sources']
+    assert (columns['name'], one['name'], two['name']) == ('columns.yaml', 'one.csv', 'two.csv')
+    assert one['bytes'] == files[0].stat().st_size
+    assert one['fingerprint'] == two['fingerprint'] != columns['fingerprint']  # equal content
+    write(tmp_path, table(w=[0.5] * 7), name='two')
+    again = convert(tmp_path, *files).made_from['sources']
+    assert again[:2] == [columns, one]
+    assert again[2]['fingerprint'] != two['fingerprint']
+    main(['inspect', str(tmp_path / 'out.npz'), '--out', str(tmp_path / 'c.png')])
+    assert f'made by import-table from columns.yaml ({columns["fingerprint"]}), one.csv' in (
+        capsys.readouterr().out
+    )
+
+
+def test_commands_with_a_reach_lead_what_is_measured(tmp_path, capsys):
+    lead = MAP.replace('low: -0.5, high: 1.5', 'measured: y, reach: 2')
+    assert lead != MAP
+    content = table(y=[9.0] * 7, v=[8.0, 9.0, 10.0, 11.0, 7.0, 9.0, 9.0])
+    file = write(tmp_path, content)
+    assert convert(tmp_path, file, columns=lead).actions[:4, 0].tolist() == [-0.5, 0, 0.5, 1]
+    nearer = lead.replace('reach: 2', 'reach: 1')
+    error = complaint(capsys, tmp_path, file, columns=nearer)
+    assert 'v less its measured value is 2 in row 3, beyond -1 to 1' in error
+    nobody = lead.replace('measured: y', 'measured: z')
+    error = complaint(capsys, tmp_path, file, columns=nobody)
+    assert 'no observed value is named z (there are: ' in error
+    error = complaint(capsys, tmp_path, file, columns=lead.replace(', reach: 2', ''))
+    assert 'give measured and reach, or neither' in error
+
+
 @pytest.mark.parametrize(
     ('changes', 'error'),
     [

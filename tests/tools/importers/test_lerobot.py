@@ -17,7 +17,7 @@ import pyarrow.dataset as pads
 import pyarrow.parquet as pq
 import pytest
 from tests.core.builders import DATA, random_dataset
-from tests.core.robot.messages import contract, DRIVE
+from tests.core.robot.messages import ARM, contract, DRIVE
 
 PUSHT = DATA / 'lerobot_pusht'
 DATA_FILE = 'data/chunk-000/file-000.parquet'
@@ -264,16 +264,30 @@ class TestExport:
         again = convert(self.export(dataset, tmp_path, '--fps', '10'))
         assert again.fingerprint == dataset.fingerprint
 
-    def test_commands_are_in_units_of_the_robot(self, tmp_path):
-        (tmp_path / 'cart.yaml').write_text(DRIVE)
-        dataset = random_dataset((6, 4), obs_dim=4)
+    @pytest.mark.parametrize(
+        ('text', 'robot', 'observed', 'commanded'),
+        [
+            (DRIVE, 'cart', ['x', 'y', 'yaw.cos', 'yaw.sin'], ['linear.x', 'angular.z']),
+            (
+                ARM.replace('low: -3, high: [3, 2], max_rate: 1', 'low: -9, high: 9, reach: 0.5'),
+                'arm',
+                ['a.position', 'b.position'],
+                ['b.data', 'a.data'],
+            ),
+        ],
+        ids=['cart', 'arm'],
+    )
+    def test_commands_are_in_units_of_the_robot(self, tmp_path, text, robot, observed, commanded):
+        (tmp_path / 'cart.yaml').write_text(text)
+        dataset = random_dataset((6, 4), obs_dim=len(observed))
         folder = self.export(dataset, tmp_path, '--contract', str(tmp_path / 'cart.yaml'))
         info = json.loads((folder / 'meta' / 'info.json').read_text())
-        assert (info['fps'], info['robot_type']) == (10, 'cart')
-        assert info['features']['action']['names'] == ['linear.x', 'angular.z']
-        assert info['features']['observation.state']['names'] == ['x', 'y', 'yaw.cos', 'yaw.sin']
+        assert (info['fps'], info['robot_type']) == (10, robot)
+        assert info['features']['action']['names'] == commanded
+        assert info['features']['observation.state']['names'] == observed
         written = np.array(pq.read_table(folder / DATA_FILE)['action'].to_pylist())
-        commands = Limits(contract().act[0]).to_command(dataset.actions)
+        whole = contract(text)
+        commands = Limits(whole, whole.act[0]).to_command(dataset.actions, dataset.observations)
         np.testing.assert_allclose(written, commands, rtol=1e-6)
         again = convert(folder, '--contract', str(tmp_path / 'cart.yaml'))
         np.testing.assert_array_equal(again.observations, dataset.observations)

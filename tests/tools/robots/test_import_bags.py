@@ -57,6 +57,8 @@ def test_drive_becomes_a_trajectory(contract_file, tmp_path, storage, compressio
     bag = write(tmp_path / 'bag', drive(), storage, compression)
     dataset = convert(contract_file, bag)
     assert (dataset.num_episodes, dataset.num_transitions) == (1, 19)
+    assert [each['name'] for each in dataset.made_from['sources']] == ['cart.yaml', 'bag']
+    assert dataset.made_from['sources'][1]['bytes'] == sum(f.stat().st_size for f in bag.iterdir())
     steps = np.arange(20)
     np.testing.assert_allclose(dataset.observations[:, 0], 0.05 * steps, atol=1e-6)
     assert (dataset.observations[:, 1] == 0).all()  # the origin is taken off
@@ -191,20 +193,37 @@ def test_command_at_the_time_of_an_observation_is_not_its_answer(contract_file, 
     np.testing.assert_allclose(actions[:, 1], (0.1 * np.arange(1, 10) - 1) / 2, atol=1e-6)
 
 
-def test_joints_are_mapped_by_name(tmp_path):
-    file = tmp_path / 'arm.yaml'
-    file.write_text(ARM)
+def reaching(tmp_path: Path) -> Path:
+    """A bag of an arm whose joints, told in changing order, are commanded elsewhere."""
     layout = make('std_msgs/msg/MultiArrayLayout', dim=[], data_offset=0)
     messages = []
     for step in range(5):
         now = T0 + step * STEP
         orders = (['a', 'b'], [1.0, 2.0]), (['b', 'a'], [2.0, 1.0])
         messages.append(('/joint_states', joint_state(now, *orders[step % 2]), now))
-        target = make('std_msgs/msg/Float64MultiArray', layout=layout, data=np.array([3.0, -3.0]))
+        target = make('std_msgs/msg/Float64MultiArray', layout=layout, data=np.array([3.0, 0.0]))
         messages.append(('/targets', target, now + 1))
-    dataset = convert(file, write(tmp_path / 'bag', messages))
+    return write(tmp_path / 'bag', messages)
+
+
+@pytest.mark.parametrize(
+    ('how', 'action'),
+    [('max_rate: 1', [1.0, 0.2]), ('reach: [4, 2]', [0.25, -0.5])],  # commanded: b, a
+)
+def test_joints_are_mapped_by_name(tmp_path, how, action):
+    file = tmp_path / 'arm.yaml'
+    file.write_text(ARM.replace('max_rate: 1', how))
+    dataset = convert(file, reaching(tmp_path))
     assert dataset.observations.tolist() == [[1.0, 2.0]] * 5
-    assert dataset.actions[:-1].tolist() == [[1.0, -1.0]] * 4
+    np.testing.assert_allclose(dataset.actions[:-1], [action] * 4, rtol=1e-6)
+
+
+def test_command_out_of_reach_is_refused_and_not_clipped(tmp_path, capsys):
+    file = tmp_path / 'arm.yaml'
+    file.write_text(ARM.replace('max_rate: 1', 'reach: 0.9'))
+    error = complaint(file, reaching(tmp_path), capsys)
+    assert 'targets, message 1: commands [3.0, 0.0], further than [0.9, 0.9] from' in error
+    assert 'the measured [2.0, 1.0]: widen reach in the contract' in error
 
 
 def test_command_beyond_the_limits_is_refused_and_not_clipped(contract_file, tmp_path, capsys):

@@ -93,7 +93,7 @@ class Rates:
     def __init__(self, run: 'PretrainSettings') -> None:
         """Of the agent and the environment of a run of pre-training."""
         self._run = run
-        self.simulator = make_simulator(run.environment)
+        self.simulator = make_simulator(run.maze)
         spec, rng = self.simulator.spec, np.random.default_rng(0)
         terminals = np.zeros(_ROWS, bool)
         terminals[-1] = True

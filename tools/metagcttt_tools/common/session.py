@@ -273,10 +273,23 @@ def process_group(device: str) -> Iterator[None]:
         distributed.destroy_process_group()
 
 
-def history_entry(stage: str, settings: RunSettings, decisive: dict[str, Any]) -> dict[str, Any]:
-    """The record of a run in the history of the policy that comes of it."""
+def history_entry(
+    stage: str,
+    settings: RunSettings,
+    decisive: dict[str, Any],
+    made_from: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    """The record of a run in the history of the policy that comes of it.
+
+    Args:
+        stage: `pretrain` or `post_train`.
+        settings: Of the program.
+        decisive: Everything that decides the result; see `TrainingRun`.
+        made_from: What the dataset was made from, if it says so.
+    """
     steps = {name: leaves(settings)[name] for name in settings.may_grow}
-    return {'stage': stage, **nested(decisive | steps), **provenance()}
+    origin = {'made_from': made_from} if made_from else {}
+    return {'stage': stage, **nested(decisive | steps), **origin, **provenance()}
 
 
 def provenance() -> dict[str, Any]:

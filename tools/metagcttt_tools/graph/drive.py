@@ -20,7 +20,7 @@ Drive = Callable[[MazeClient], GoalOutcome]
 ArmT = TypeVar('ArmT')
 OutcomeT = TypeVar('OutcomeT')
 
-START_TIMEOUT_S = 30.0
+START_TIMEOUT_S = 120.0
 _LOCKSTEP = {'stepping': 'lockstep'}
 
 

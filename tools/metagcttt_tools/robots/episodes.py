@@ -1,13 +1,16 @@
 """Trajectories from recorded messages of a robot, by its contract."""
 
 from bisect import bisect_right
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import groupby
+from typing import Any
 
 from metagcttt_core.data import DatasetError, TrajectoryDataset
 from metagcttt_core.robot import Contract, MessageError, Observer
 from metagcttt_core.robot.commands import Limits, read_command
+from metagcttt_core.robot.contract import CommandTopic
 import numpy as np
 
 from metagcttt_tools.robots.bag import Recorded
@@ -98,25 +101,56 @@ class _Row:
 
 
 class _Commands:
-    """The recorded commands of one topic as actions."""
+    """The recorded commands of one topic, which become actions where they answer something."""
 
-    def __init__(self, timeout_s: float) -> None:
-        self._timeout_ns = round(timeout_s * 1e9)
+    def __init__(self, contract: Contract, topic: CommandTopic) -> None:
+        self._topic = topic
+        self._limits = Limits(contract, topic)
+        self._timeout_ns = round(topic.timeout_s * 1e9)
         self._times_ns: list[int] = []
-        self._actions: list[np.ndarray | None] = []
+        self._commands: list[np.ndarray | None] = []
 
-    def add(self, time_ns: int, action: np.ndarray | None) -> None:
+    def add(self, message: Any, time_ns: int) -> str:
+        """Take in a message; returns why it is refused, or nothing.
+
+        Raises:
+            DatasetError: If it commands something outside the limits.
+        """
+        command, refusal = None, ''
+        try:
+            command = read_command(self._topic, message)
+        except MessageError as error:
+            refusal = f'{self._topic.topic}: {error}'
         self._times_ns.append(time_ns)
-        self._actions.append(action)
+        self._commands.append(command)
+        if command is not None:
+            with self._naming(len(self._commands)):
+                self._limits.check(command)
+        return refusal
 
-    def between(self, start_ns: int, stop_ns: int) -> np.ndarray | None:
-        """The first command of a control period, else the one still in force at its start."""
-        index = bisect_right(self._times_ns, start_ns)
-        if index < len(self._times_ns) and self._times_ns[index] <= stop_ns:
-            return self._actions[index]
-        if index and start_ns - self._times_ns[index - 1] <= self._timeout_ns:
-            return self._actions[index - 1]
-        return None
+    def action(self, row: _Row, stop_ns: int) -> np.ndarray | None:
+        """That of the first command from a row to `stop_ns`, or of the one in force before it.
+
+        Raises:
+            DatasetError: If the command is out of reach of what the row observes.
+        """
+        number = bisect_right(self._times_ns, row.time_ns)
+        if number == len(self._times_ns) or self._times_ns[number] > stop_ns:
+            number -= 1
+            if number < 0 or row.time_ns - self._times_ns[number] > self._timeout_ns:
+                return None
+        command = self._commands[number]
+        if command is None:
+            return None
+        with self._naming(number + 1):
+            return self._limits.to_action(command, row.observation)
+
+    @contextmanager
+    def _naming(self, number: int) -> Iterator[None]:
+        try:
+            yield
+        except MessageError as error:
+            raise DatasetError(f'{self._topic.topic}, message {number}: {error}') from error
 
 
 def read_episodes(contract: Contract, messages: Iterable[Recorded]) -> Episodes:
@@ -131,11 +165,9 @@ def read_episodes(contract: Contract, messages: Iterable[Recorded]) -> Episodes:
         messages: In the order of reception.
 
     Raises:
-        DatasetError: If a command is outside the limits of the contract.
+        DatasetError: If a command is outside the limits of the contract, or out of reach.
     """
-    acted = {topic.topic: topic for topic in contract.act}
-    limits = {topic.topic: Limits(topic) for topic in contract.act}
-    commands = {topic.topic: _Commands(topic.timeout_s) for topic in contract.act}
+    commands = {topic.topic: _Commands(contract, topic) for topic in contract.act}
     topics = [topic.topic for topic in contract.topics]
     found = Episodes({topic: TopicCount() for topic in topics})
     observer = Observer(contract)
@@ -147,21 +179,12 @@ def read_episodes(contract: Contract, messages: Iterable[Recorded]) -> Episodes:
         while tick_ns < received_ns:
             _sample(observer, tick_ns, found, rows)
             tick_ns += contract.period_ns
-        if topic not in acted:
-            found.counts[topic].add(received_ns, observer.take(topic, message, received_ns))
-            continue
-        try:
-            command, refusal = read_command(acted[topic], message), ''
-        except MessageError as error:
-            commands[topic].add(received_ns, None)
-            refusal = f'{topic}: {error}'
-        else:
-            try:
-                commands[topic].add(received_ns, limits[topic].to_action(command))
-            except MessageError as error:
-                message_number = found.counts[topic].received + 1
-                raise DatasetError(f'{topic}, message {message_number}: {error}') from error
-        found.counts[topic].add(received_ns, refusal)
+        taken = (
+            commands[topic].add(message, received_ns)
+            if topic in commands
+            else observer.take(topic, message, received_ns)
+        )
+        found.counts[topic].add(received_ns, taken)
     if tick_ns == received_ns:
         _sample(observer, tick_ns, found, rows)
     found.trajectories = _trajectories(contract, rows, list(commands.values()))
@@ -188,7 +211,7 @@ def _trajectories(
         actions: list[np.ndarray] = []
         for row in segment:
             end_ns = row.time_ns + contract.period_ns
-            parts = [each.between(row.time_ns, end_ns) for each in commands]
+            parts = [each.action(row, end_ns) for each in commands]
             observations.append(row.observation)
             complete = [part for part in parts if part is not None]
             if len(complete) == len(parts):

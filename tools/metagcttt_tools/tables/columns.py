@@ -30,7 +30,11 @@ class ObservedColumn(Settings):
 
 
 class CommandColumn(Settings):
-    """A column of the action; with limits, `low` to `high` become -1 to 1."""
+    """A column of the action.
+
+    With limits, `low` to `high` become -1 to 1; with `reach`, the observed value `measured` less
+    and plus that.
+    """
 
     column: str = Field(min_length=1, description='its name')
     values: tuple[int | str, ...] = Field(
@@ -38,9 +42,17 @@ class CommandColumn(Settings):
     )
     low: float | None = Field(None, description='lowest command, in units of the table')
     high: float | None = Field(None, description='highest command, in units of the table')
+    measured: str = Field(
+        '', description='name of the observed value that the command leads, such as a joint'
+    )
+    reach: float | None = Field(
+        None, gt=0, description='farthest command from the measured value, in units of the table'
+    )
 
     @model_validator(mode='after')
     def _check_limits(self) -> Self:
+        if (self.reach is None) == bool(self.measured):
+            raise ValueError('give measured and reach, or neither')
         if (self.low is None) != (self.high is None):
             raise ValueError('give low and high, or neither')
         if self.low is not None and self.high is not None and self.low >= self.high:
@@ -131,19 +143,18 @@ def map_of_contract(
         observed_in: Column of lists that holds the observed values; else each is a column.
         commanded_in: The same for the commands.
     """
-    limits = [
-        limits
-        for topic in contract.act
-        for value in topic.values
-        for limits in zip(*value.limits, strict=True)
+    how = [
+        {'low': each['low'], 'high': each['high']}
+        | ({'measured': each['from'], 'reach': each['reach']} if 'reach' in each else {})
+        for each in contract.meaning['actions']
     ]
     return ColumnMap(
         observations=tuple(
             ObservedColumn(**_place(name, observed_in)) for name in contract.columns
         ),
         actions=tuple(
-            CommandColumn(**_place(name, commanded_in), low=low, high=high)
-            for name, (low, high) in zip(commanded_names(contract), limits, strict=True)
+            CommandColumn(**_place(name, commanded_in), **limits)
+            for name, limits in zip(commanded_names(contract), how, strict=True)
         ),
         position=tuple(contract.columns[dim] for dim in contract.position_dims),
     )

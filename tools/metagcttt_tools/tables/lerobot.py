@@ -19,6 +19,8 @@ from metagcttt_tools.tables.files import numbers, read_parquet
 from metagcttt_tools.tables.rows import changes, Found, make_rows, Rows, to_dataset
 
 STATE, ACTION = 'observation.state', 'action'
+READ = ('meta/**/*', 'data/**/*')
+"""Patterns of the files that are read."""
 DEFAULT_MAP = ColumnMap(
     observations=(ObservedColumn(column=STATE),), actions=(CommandColumn(column=ACTION),)
 )

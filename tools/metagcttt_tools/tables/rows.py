@@ -24,12 +24,23 @@ _BEYOND = 1e-4
 
 @dataclass(frozen=True)
 class Value:
-    """One observed or commanded value in all rows."""
+    """One observed or commanded value in all rows.
+
+    Attributes:
+        name: Its name.
+        numbers: (N,), in units of the table.
+        low: The lowest command, if there is one.
+        high: The highest.
+        reach: How far a command leads the measured value at most, if actions are such distances.
+        measured: (N,) that value.
+    """
 
     name: str
     numbers: NDArray[np.float64]
     low: float | None = None
     high: float | None = None
+    reach: float | None = None
+    measured: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -152,16 +163,22 @@ def make_rows(
                 f'{where}: the time is {times[row]:g} s in row {row}, after {times[row - 1]:g} s, '
                 'and no trajectory ends between them'
             )
-    observed = [
-        Value(name, content - each.origin)
+    found = [
+        (name, content, each.origin)
         for each in columns.observations
         for name, content in _values(table, each, names, where)
     ]
+    known = {name: content for name, content, _ in found}
+    if unknown := [each.measured for each in columns.actions if each.measured not in {'', *known}]:
+        raise DatasetError(
+            f'{where}: no observed value is named {unknown[0]} (there are: {", ".join(known)})'
+        )
     commanded = [
-        Value(name, content, each.low, each.high)
+        Value(name, content, each.low, each.high, each.reach, known.get(each.measured))
         for each in columns.actions
         for name, content in _values(table, each, names, where)
     ]
+    observed = [Value(name, content - origin) for name, content, origin in found]
     return Rows(where, observed, commanded, ends, times)
 
 
@@ -209,7 +226,11 @@ def to_dataset(
         single=sum(int((~keep).sum()) for keep in kept),
         observed=observed,
         commanded=commanded,
-        limits={name: pair for name, pair in zip(commanded, limits, strict=True) if pair},
+        limits={
+            value.name: pair
+            for value, pair in zip(first.commanded, limits, strict=True)
+            if pair and not value.reach
+        },
         position=[observed.index(name) for name in columns.position],
     )
 
@@ -219,7 +240,7 @@ def _limits(parts: Sequence[Rows], limits_from_data: bool) -> list[tuple[float, 
     for number, value in enumerate(parts[0].commanded):
         if value.low is not None and value.high is not None:
             found.append((value.low, value.high))
-        elif limits_from_data:
+        elif limits_from_data and not value.reach:
             content = np.concatenate([part.commanded[number].numbers for part in parts])
             low, high = float(content.min()), float(content.max())
             if not low < high:  # also for nan
@@ -235,18 +256,40 @@ def _limits(parts: Sequence[Rows], limits_from_data: bool) -> list[tuple[float, 
 def _actions(part: Rows, limits: Sequence[tuple[float, float] | None]) -> NDArray[np.float64]:
     actions = []
     for value, pair in zip(part.commanded, limits, strict=True):
-        low, high = pair or (-1.0, 1.0)
-        slack = (_ROUNDING if pair else _BEYOND) * (high - low)
-        beyond = np.flatnonzero((value.numbers < low - slack) | (value.numbers > high + slack))
-        if len(beyond):
-            hint = '' if pair else ': give low and high, or --limits-from-data'
-            raise DatasetError(
-                f'{part.where}: {value.name} is {value.numbers[beyond[0]]:g} in row {beyond[0]}, '
-                f'beyond {low:g} to {high:g}{hint}'
+        if pair:
+            _must_be_within(part.where, value.name, value.numbers, *pair)
+        if value.reach is not None and value.measured is not None:
+            ahead, reach = value.numbers - value.measured, value.reach
+            _must_be_within(
+                part.where, f'{value.name} less its measured value', ahead, -reach, reach
             )
-        scaled = 2 * (value.numbers - low) / (high - low) - 1 if pair else value.numbers
+            scaled = ahead / reach
+        elif pair:
+            scaled = 2 * (value.numbers - pair[0]) / (pair[1] - pair[0]) - 1
+        else:
+            hint = ': give low and high, or --limits-from-data'
+            _must_be_within(part.where, value.name, value.numbers, -1.0, 1.0, _BEYOND, hint)
+            scaled = value.numbers
         actions.append(np.clip(scaled, -1, 1))  # rounding
     return np.stack(actions, axis=1)
+
+
+def _must_be_within(
+    where: str,
+    name: str,
+    numbers: NDArray[np.float64],
+    low: float,
+    high: float,
+    rounding: float = _ROUNDING,
+    hint: str = '',
+) -> None:
+    slack = rounding * (high - low)
+    beyond = np.flatnonzero((numbers < low - slack) | (numbers > high + slack))
+    if len(beyond):
+        row = beyond[0]
+        raise DatasetError(
+            f'{where}: {name} is {numbers[row]:g} in row {row}, beyond {low:g} to {high:g}{hint}'
+        )
 
 
 def _times(table: pa.Table, columns: ColumnMap, where: str) -> NDArray[np.float64] | None:

@@ -1,7 +1,11 @@
-"""Moves an arm to random positions of its joints, over what stands beside it, with noise."""
+"""Moves an arm to places or random positions of its joints, over what is beside it, with noise."""
+
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -22,10 +26,27 @@ RAISED = 1.1
 class ArmDriver(Node):
     """Answers every `joint_states` with targets on `arm_controller/commands`."""
 
-    def __init__(self) -> None:
-        """Wait for the arm."""
-        super().__init__('arm_driver')
+    def __init__(self, **kwargs: Any) -> None:
+        """Wait for the arm.
+
+        Args:
+            kwargs: For `rclpy.node.Node`.
+
+        Raises:
+            ValueError: If `places` are not positions of all joints, within the limits.
+        """
+        super().__init__('arm_driver', **kwargs)
         self._noise = number(self, 'noise', 0.03, 0.0, 1.0, 'deviation of the targets, rad')
+        places = self.declare_parameter(
+            'places',
+            [0.0],
+            ParameterDescriptor(
+                description='pan, lift, elbow, wrist, pan, ... (rad) to move between; '
+                '[0.0]: anywhere',
+                read_only=True,
+            ),
+        ).value
+        self._places = _as_places(places if len(places) > 1 else [])
         seed = number(self, 'seed', 0.0, 0.0, 1e9, 'of goals and noise')
         self._rng = np.random.default_rng(int(seed))
         self._way: list[NDArray[np.float64]] = []
@@ -51,11 +72,28 @@ class ArmDriver(Node):
         self._commands.publish(Float64MultiArray(data=target.tolist()))
 
     def _plan(self, here: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Straight to a random goal, or raised across the middle and down again."""
-        goal = self._rng.uniform(LOW, HIGH)
+        """Straight to a goal, or raised across the middle and down again."""
+        goal = self._goal(here)
         if here[0] * goal[0] > 0:
             return [goal]
         over = [here.copy(), goal.copy()]
         for point in over:
             point[1], point[2] = RAISED, -0.3
         return [*over, goal]
+
+    def _goal(self, here: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Positions to move to: another place, or any."""
+        others = self._places[np.abs(self._places - here).max(axis=1) > 2 * NEAR]
+        if len(others):
+            return np.asarray(others[self._rng.integers(len(others))])
+        return self._rng.uniform(LOW, HIGH)
+
+
+def _as_places(numbers: Sequence[float]) -> NDArray[np.float64]:
+    """Positions of all joints, (n, 4), rad."""
+    if len(numbers) % len(JOINTS):
+        raise ValueError(f'places needs {len(JOINTS)} numbers each, got {len(numbers)}')
+    places = np.array(numbers, float).reshape(-1, len(JOINTS))
+    if ((places < LOW) | (places > HIGH)).any():
+        raise ValueError(f'places are from {LOW.tolist()} to {HIGH.tolist()}, got {numbers}')
+    return places

@@ -1,4 +1,7 @@
-"""Entry points of the executables. Slow imports wait until signals are handled."""
+"""Entry points of the executables. Slow imports wait until signals are handled.
+
+The guard is this package's own: the robots stand in for a user's and know nothing of `metagcttt`.
+"""
 
 from collections.abc import Callable
 import signal
