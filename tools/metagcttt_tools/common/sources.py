@@ -37,26 +37,25 @@ def identities(
         `fingerprints`, see there, and, where the dataset says so, what it was `made_from`; that is
         no part of the former, since equal data are equal wherever they come from.
     """
+    policies = _hashes(checkpoints, actor_loss)  # first, as they are read sooner than data
     data = TrajectoryDataset.load(dataset)
     made_from = {'made_from': data.made_from} if data.made_from else {}
-    return {'fingerprints': _hashes(data, checkpoints, actor_loss), **made_from}
+    return {'fingerprints': {'dataset': data.fingerprint, 'policies': policies}, **made_from}
 
 
 def fingerprints(
     dataset: Path, checkpoints: Sequence[Path], actor_loss: ActorLoss | None = None
 ) -> dict[str, Any]:
     """Hashes of a dataset and of policies, as they are adapted; see `identities`."""
-    return _hashes(TrajectoryDataset.load(dataset), checkpoints, actor_loss)
+    found: dict[str, Any] = identities(dataset, checkpoints, actor_loss)['fingerprints']
+    return found
 
 
-def _hashes(
-    dataset: TrajectoryDataset, checkpoints: Sequence[Path], actor_loss: ActorLoss | None
-) -> dict[str, Any]:
+def _hashes(checkpoints: Sequence[Path], actor_loss: ActorLoss | None) -> list[str]:
     from metagcttt_core import load_checkpoint
 
     changes = {'actor_loss': actor_loss} if actor_loss else {}
-    policies = [load_checkpoint(path, changes=changes).fingerprint() for path in checkpoints]
-    return {'dataset': dataset.fingerprint, 'policies': policies}
+    return [load_checkpoint(path, changes=changes).fingerprint() for path in checkpoints]
 
 
 def in_words(made_from: dict[str, Any]) -> str:
