@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -32,18 +33,27 @@ click in a browser, until Ctrl-C."""
 
 
 class _Maze(NamedTuple):
-    """A maze to drive: its simulator, its assets and the preset that packs them."""
+    """A maze to drive: its simulator, its assets and the preset that packs them.
+
+    `adaptation` are parameters of the policy node, those of the preset's test-time training.
+    """
 
     environment: str
     assets: str
     preset: str
+    adaptation: Mapping[str, Any] = {}
 
 
 _MAZES = {
     'point': _Maze(
         'pointmaze-medium-v0', 'pointmaze-medium-navigate', 'pointmaze-medium-navigate-cpu'
     ),
-    'ant': _Maze('antmaze-medium-v0', 'antmaze-medium-navigate', 'antmaze-medium-navigate-saw'),
+    'ant': _Maze(
+        'antmaze-medium-v0',
+        'antmaze-medium-navigate',
+        'antmaze-medium-navigate-saw',
+        {'adapt_lr': 3e-5, 'actor_only': True},
+    ),
 }
 
 
@@ -110,7 +120,7 @@ def main(argv: list[str] | None = None) -> None:
             return
         maze = _MAZES[settings.robot]
         assets = demo_report.packed_assets(maze.assets, maze.preset)
-        outcomes = run_arms(settings, maze.environment, assets)
+        outcomes = run_arms(settings, maze, assets)
         report(settings, maze.environment, assets / 'dataset.npz', outcomes)
         if settings.film:
             from metagcttt_tools import demo_film
@@ -129,9 +139,7 @@ def main(argv: list[str] | None = None) -> None:
         raise SystemExit(130) from None
 
 
-def run_arms(
-    settings: DemoSettings, environment: str, assets: Path
-) -> dict[str, list[GoalOutcome]]:
+def run_arms(settings: DemoSettings, maze: _Maze, assets: Path) -> dict[str, list[GoalOutcome]]:
     """Outcome of each task's goal by arm, from three processes that talk over DDS."""
     from metagcttt_tools.graph.client import MazeClient
     from metagcttt_tools.graph.drive import drive_arms
@@ -139,7 +147,12 @@ def run_arms(
     dataset = {'dataset': str(assets / 'dataset.npz')}
     return drive_arms(
         {
-            arm: {**dataset, 'checkpoint': str(checkpoint), 'adapt_steps': steps}
+            arm: {
+                **dataset,
+                **maze.adaptation,
+                'checkpoint': str(checkpoint),
+                'adapt_steps': steps,
+            }
             for arm, (checkpoint, steps) in demo_report.arms_of(assets, settings.budget).items()
         },
         [
@@ -149,11 +162,11 @@ def run_arms(
                 seed=settings.seed,
                 timeout_s=settings.timeout_s,
             )
-            for task in make_simulator(environment).tasks
+            for task in make_simulator(maze.environment).tasks
         ],
         logs=settings.out / 'logs',
-        simulator={'environment': environment},
-        goal_node={'environment': environment, **dataset},
+        simulator={'environment': maze.environment},
+        goal_node={'environment': maze.environment, **dataset},
     )
 
 
