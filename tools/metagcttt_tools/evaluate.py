@@ -32,7 +32,7 @@ from metagcttt_tools.common.job_log import JobLog
 from metagcttt_tools.common.results import markdown_table, start_column
 from metagcttt_tools.common.resume import kept_in, Resumable
 from metagcttt_tools.common.session import provenance, sole_writer, use_threads
-from metagcttt_tools.common.sources import identities
+from metagcttt_tools.common.sources import check_fingerprints, identities
 
 _DESCRIPTION = """Success of policies by test-time training budget.
 
@@ -232,17 +232,6 @@ def finished_before(
     report = read_json(out)
     check_fingerprints(out, report, fingerprints)
     return report
-
-
-def check_fingerprints(file: Path, report: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Refuse results of other data or policies than those that are there now.
-
-    Raises:
-        ValueError: If one differs; names the file, and what differs.
-    """
-    for name, was in report.get('fingerprints', {}).items():
-        if was != now.get(name):
-            raise ValueError(f'{file}: is of other {name}, was {was!r} and is now {now[name]!r}')
 
 
 def _run_jobs(

@@ -18,8 +18,7 @@ from pydantic import Field, model_validator
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.results import markdown_table
 from metagcttt_tools.common.session import provenance, sole_writer
-from metagcttt_tools.common.sources import fingerprints, identities
-from metagcttt_tools.evaluate import check_fingerprints
+from metagcttt_tools.common.sources import check_fingerprints, fingerprints, identities
 
 if TYPE_CHECKING:
     from metagcttt_tools.graph.robot import RobotOutcome

@@ -16,9 +16,8 @@ from sim_bridge import make_simulator
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.environment import environment_of
 from metagcttt_tools.common.session import provenance, sole_writer
-from metagcttt_tools.common.sources import fingerprints
+from metagcttt_tools.common.sources import check_fingerprints, fingerprints
 from metagcttt_tools.evaluate import (
-    check_fingerprints,
     EpisodeSettings,
     format_table,
     success_curve,

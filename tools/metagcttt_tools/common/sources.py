@@ -1,6 +1,6 @@
 """What a dataset was made from: a record that travels with it into policies and results."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import hashlib
 from pathlib import Path
 from typing import Any
@@ -56,6 +56,17 @@ def _hashes(checkpoints: Sequence[Path], actor_loss: ActorLoss | None) -> list[s
 
     changes = {'actor_loss': actor_loss} if actor_loss else {}
     return [load_checkpoint(path, changes=changes).fingerprint() for path in checkpoints]
+
+
+def check_fingerprints(file: Path, report: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Refuse results of other data or policies than those that are there now.
+
+    Raises:
+        ValueError: If one differs; names the file, and what differs.
+    """
+    for name, was in report.get('fingerprints', {}).items():
+        if was != now.get(name):
+            raise ValueError(f'{file}: is of other {name}, was {was!r} and is now {now[name]!r}')
 
 
 def in_words(made_from: dict[str, Any]) -> str:
