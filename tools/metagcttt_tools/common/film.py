@@ -12,8 +12,6 @@ from PIL import Image
 from sim_bridge.opengl import rendering_help
 from sim_bridge.simulator import SimulatorError
 
-from metagcttt_tools.common.plots import write_gif
-
 Picture = NDArray[np.uint8]
 
 
@@ -56,6 +54,8 @@ def add_shape(
 
 def write_film(path: Path, pictures: Sequence[Picture], frame_ms: int) -> None:
     """Write pictures (height, width, 3) as a GIF that repeats, `frame_ms` each."""
+    from metagcttt_tools.common.plots import write_gif  # with matplotlib, which takes a second
+
     images = [Image.fromarray(picture) for picture in pictures]
     # One palette, that keeps the colours of small things too: colours shall not flicker.
     palette = images[0].quantize(64, Image.Quantize.MAXCOVERAGE)
