@@ -14,6 +14,7 @@ from metagcttt_tools import (
     download,
     generate,
     import_bags,
+    import_recordings,
     inspect_data,
     top_view,
 )
@@ -91,6 +92,7 @@ def watch_import(patch: pytest.MonkeyPatch, seen: Seen) -> None:
         return random_dataset(), summary
 
     patch.setattr(trajectories, 'read_recordings', note)
+    patch.setattr(import_recordings, 'made_by', lambda program, paths: {'program': program})
 
 
 IMPORT = Walk(
@@ -138,6 +140,7 @@ def watch_bags(patch: pytest.MonkeyPatch, seen: Seen) -> None:
 
     trajectory = (np.arange(12.0).reshape(3, 4), np.zeros((3, 2)))
     patch.setattr(import_bags, 'load_contract', lambda path: seen.append(path) or CART)
+    patch.setattr(import_bags, 'made_by', lambda program, paths: {'program': program})
     patch.setattr(bag, 'open_bag', note)
     patch.setattr(report, 'bag_faults', lambda *_: [])
     patch.setattr(

@@ -9,7 +9,7 @@ from metagcttt import commander
 import metagcttt_core
 from metagcttt_core.config import assets_dir
 from metagcttt_interfaces.srv import Adapt
-from metagcttt_tools import demo, demo_film
+from metagcttt_tools import demo, demo_film, evaluate_robot
 from metagcttt_tools.benchmarks import adapter, restarts, ros, state_source
 from metagcttt_tools.benchmarks.fleet_robot import Outcome
 from metagcttt_tools.common import demo_report
@@ -50,6 +50,8 @@ def watch_robot(patch: pytest.MonkeyPatch, seen: Seen) -> None:
         return {arm: [outcome] * len(drives) for arm in arms}
 
     patch.setattr(drive, 'drive_policies', note)
+    patch.setattr(evaluate_robot, 'identities', lambda *_: {'fingerprints': {}})
+    patch.setattr(evaluate_robot, 'fingerprints', lambda *_: {})
     patch.setattr(demo_report, 'draw', lambda *_: None)
 
 
