@@ -10,6 +10,9 @@ from torch import nn, Tensor
 
 from metagcttt_core.data.scaling import Scaling
 
+# Rows a processor evaluates at a time, so that what lies between the layers stays in its cache.
+_BLOCK_ROWS = 512
+
 
 class ValueAgent(Protocol):
     """An agent that has a value function."""
@@ -52,4 +55,7 @@ class StateValue:
         scaled = self.agent.scaling.observations
         states = torch.from_numpy(scaled(observations)).to(device)
         goals = torch.from_numpy(scaled(goal)).to(device).expand_as(states)
-        return self.agent.state_value(states, goals).cpu().numpy()
+        if device.type != 'cpu':
+            return self.agent.state_value(states, goals).cpu().numpy()
+        blocks = zip(states.split(_BLOCK_ROWS), goals.split(_BLOCK_ROWS), strict=True)
+        return torch.cat([self.agent.state_value(*block) for block in blocks]).numpy()
