@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 from sim_bridge.opengl import rendering_help
 from sim_bridge.simulator import SimulatorError
 
@@ -54,7 +53,9 @@ def add_shape(
 
 def write_film(path: Path, pictures: Sequence[Picture], frame_ms: int) -> None:
     """Write pictures (height, width, 3) as a GIF that repeats, `frame_ms` each."""
-    from metagcttt_tools.common.plots import write_gif  # with matplotlib, which takes a second
+    from PIL import Image  # here, as not every installation has it, nor matplotlib
+
+    from metagcttt_tools.common.plots import write_gif
 
     images = [Image.fromarray(picture) for picture in pictures]
     # One palette, that keeps the colours of small things too: colours shall not flicker.
