@@ -50,7 +50,7 @@ import numpy as np
 
 rng = np.random.default_rng(0)
 actions = rng.uniform(-1, 1, (2000, 2))
-observations = 4 + np.cumsum(0.2 * actions, axis=0) % 8
+observations = 4 + 0.2 * np.cumsum(actions, axis=0)
 np.savez('mine.npz', observations=observations.astype(np.float32),
          actions=actions.astype(np.float32), terminals=np.arange(2000) % 100 == 99)
 PYTHON
