@@ -54,7 +54,6 @@ NOT_RUN = {
     r'tensorboard .*': 'a server',
     r'metagcttt (view|demo --view)': 'a server; tests/ros/live has it',
     r'metagcttt demo --robot .*': 'tests/tools/test_demo.py drives it',
-    r'metagcttt pack-assets --preset antmaze-.*': 'tests/tools/test_demo.py packs stand-ins',
     r'python3? -m (venv|colcon) .*': 'needs ROS 2 of the machine',
     r'(pip install .*workspace.*|cd ros2_ws.*)': 'needs ROS 2 of the machine',
     r"pip install -c constraints.txt '\.\[mazes,plots\]'": 'make wheel installs the package',
