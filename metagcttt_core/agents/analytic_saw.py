@@ -16,9 +16,10 @@ from metagcttt_core.agents.analytic import (
     outputs_of,
     take_back,
 )
+from metagcttt_core.agents.extraction import LARGEST_WEIGHT
 from metagcttt_core.agents.networks import RepresentedGoalPolicy
 from metagcttt_core.agents.passes import Passes, passes_of
-from metagcttt_core.agents.saw import LARGEST_WEIGHT, SAW
+from metagcttt_core.agents.saw import SAW
 from metagcttt_core.kernels import Kernels
 
 _SHORTEST = 1e-12  # as in `torch.nn.functional.normalize`

@@ -43,10 +43,15 @@ def extraction_loss(
     else:
         with torch.no_grad():
             advantage = critic(observations, goals, batch['actions']) - value(observations, goals)
-            weight = torch.exp(options.alpha * advantage).clamp(max=LARGEST_WEIGHT)
+            weight = advantage_weight(options.alpha * advantage)
         parts['advantage'] = advantage.mean()
         loss = -(weight * log_prob).mean()
     return loss, parts | {'actor': loss.detach()}
+
+
+def advantage_weight(exponent: Tensor) -> Tensor:
+    """The weight of a transition in advantage-weighted cloning, capped."""
+    return exponent.exp().clamp(max=LARGEST_WEIGHT)
 
 
 def frozen(network: nn.Module, *inputs: Tensor) -> Tensor:

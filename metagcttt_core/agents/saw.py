@@ -15,6 +15,7 @@ from torch import Tensor
 
 from metagcttt_core.agents.agent import Agent, log_std_of, TensorBatch
 from metagcttt_core.agents.config import AgentSettings, SAWSettings
+from metagcttt_core.agents.extraction import advantage_weight
 from metagcttt_core.agents.networks import GoalRepresentation, MLP, RepresentedGoalPolicy
 from metagcttt_core.agents.state_value import StateValue
 from metagcttt_core.data.dataset import TrajectoryDataset
@@ -23,8 +24,6 @@ from metagcttt_core.data.relabel import GoalRelabeller
 if TYPE_CHECKING:
     from metagcttt_core.agents.analytic import AnalyticLoss
     from metagcttt_core.kernels import Kernels
-
-LARGEST_WEIGHT = 100.0
 
 
 class SAW(Agent):
@@ -121,7 +120,7 @@ class SAW(Agent):
             self.subpolicy, batch['observations'], goals, batch['actions']
         )
         value, next_value = self._values(goals, batch['observations'], batch['next_observations'])
-        weight = _weight(self.settings.subpolicy_alpha * (next_value - value))
+        weight = advantage_weight(self.settings.subpolicy_alpha * (next_value - value))
         return -(weight * log_prob).mean()
 
     def _actor_loss(self, batch: TensorBatch) -> tuple[Tensor, dict[str, Tensor]]:
@@ -132,8 +131,8 @@ class SAW(Agent):
             goals, observations, batch['next_observations'], batch['waypoints']
         )
         advantage = next_value - value
-        awr = -(_weight(self.settings.alpha * advantage) * log_prob).mean()
-        weight = _weight(self.settings.waypoint_alpha * (waypoint_value - value))
+        awr = -(advantage_weight(self.settings.alpha * advantage) * log_prob).mean()
+        weight = advantage_weight(self.settings.waypoint_alpha * (waypoint_value - value))
         divergence = self._divergence(mean, observations, batch['waypoints'])
         waypoint = (weight * divergence).mean()
         loss = awr + waypoint
@@ -199,10 +198,6 @@ class SAW(Agent):
     def value_fn(self) -> StateValue:
         """V(observations (n, obs_dim), goal (obs_dim,)) -> (n,) float32."""
         return StateValue.of(self, self.value_rep, self.value1, self.value2)
-
-
-def _weight(exponent: Tensor) -> Tensor:
-    return exponent.exp().clamp(max=LARGEST_WEIGHT)
 
 
 def _join(*parts: Tensor) -> Tensor:

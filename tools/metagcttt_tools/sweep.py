@@ -194,10 +194,14 @@ class Study:
     @property
     def files(self) -> list[Path]:
         """What is written into its folder besides the manifest and folders of runs."""
-        planned = [*self.evaluations.values(), *([self.curve] if self.curve else [])]
-        evaluations = [run for run, _ in planned]
+        evaluations = self._planned_evaluations
         runs = [*self.pretraining, *(run for _, run in self.post_training), *evaluations]
         return [*map(_preset_of, runs), *(run.out for run in evaluations)]
+
+    @property
+    def _planned_evaluations(self) -> list[EvaluateSettings]:
+        planned = [*self.evaluations.values(), *([self.curve] if self.curve else [])]
+        return [run for run, _ in planned]
 
     def run(self) -> None:
         """Run whatever is not done yet."""
@@ -236,8 +240,11 @@ class Study:
         )
 
     def _not_evaluated(self) -> list[EvaluateSettings]:
-        planned = [*self.evaluations.values(), *([self.curve] if self.curve else [])]
-        return [run for run, _ in planned if not (is_evaluated(run) and _is_up_to_date(run))]
+        return [
+            run
+            for run in self._planned_evaluations
+            if not (is_evaluated(run) and _is_up_to_date(run))
+        ]
 
     def _to_evaluate(self) -> list[EvaluateSettings]:
         """What is left, outdated results of which are put aside."""

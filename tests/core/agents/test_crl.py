@@ -10,30 +10,13 @@ from metagcttt_core.training.pretrain import pretrain
 from metagcttt_core.training.step import gradient_step
 import numpy as np
 import pytest
+from tests.core.agents.slow import batch_of, SlowNetworks
 from tests.core.builders import dataset_at, random_dataset, tiny_agent, weights_of
 import torch
 
 
-def batch_of(agent, size: int = 24):
-    dataset = random_dataset([40, 30], obs_dim=agent.obs_dim, act_dim=agent.act_dim)
-    return agent.relabeller(dataset).sample(size, np.random.default_rng(0))
-
-
-class Slow:
+class Slow(SlowNetworks):
     """Networks and losses for one pair at a time, from exported arrays."""
-
-    def __init__(self, agent):
-        self.w = {k: v.astype(np.float64) for k, v in agent.export_reference_parameters().items()}
-        self.s = agent.settings
-
-    def mlp(self, net, x, head, norm):
-        for layer in range(len(self.s.hidden)):
-            x = x @ self.w[f'{net}.fc{layer}.kernel'] + self.w[f'{net}.fc{layer}.bias']
-            x = 0.5 * x * (1 + np.tanh(math.sqrt(2 / math.pi) * (x + 0.044715 * x**3)))
-            if norm:
-                x = (x - x.mean()) / math.sqrt(x.var() + 1e-6)
-                x = x * self.w[f'{net}.ln{layer}.scale'] + self.w[f'{net}.ln{layer}.bias']
-        return x @ self.w[f'{net}.{head}.kernel'] + self.w[f'{net}.{head}.bias']
 
     def score(self, net, x, g):
         phi, psi = (
@@ -95,7 +78,7 @@ class Slow:
 )
 def test_losses_equal_a_reference_of_single_pairs(settings):
     agent = tiny_agent('crl', obs_dim=3, **settings)
-    batch = batch_of(agent)
+    batch = batch_of(agent, 24)
     s, a, g = batch['observations'], batch['actions'], batch['actor_goals']
     slow, with_actions = Slow(agent), np.concatenate([s, a], axis=1)
     nets = ('critic1', 'critic2')
@@ -132,7 +115,7 @@ def test_step_moves_what_it_trains(actor_only, actor_loss):
     before = weights_of(agent)
     parameters = list(agent.trained_parameters(actor_only=actor_only))
     optimizer = make_optimizer('adam', parameters, 1e-2)
-    batch = agent.tensors(batch_of(agent))
+    batch = agent.tensors(batch_of(agent, 24))
     gradient_step(agent, optimizer, parameters, batch, actor_only=actor_only)
     after = agent.state_dict()
     moved = {name.split('.')[0] for name in before if not torch.equal(before[name], after[name])}
@@ -142,7 +125,7 @@ def test_step_moves_what_it_trains(actor_only, actor_loss):
 
 def test_critics_do_not_learn_from_the_actor_loss():
     agent = tiny_agent('crl')
-    loss, _ = agent.losses(agent.tensors(batch_of(agent)), actor_only=True)
+    loss, _ = agent.losses(agent.tensors(batch_of(agent, 24)), actor_only=True)
     loss.backward()
     got = {
         name.split('.')[0] for name, weight in agent.named_parameters() if weight.grad is not None

@@ -11,30 +11,13 @@ from metagcttt_core.training.optimizers import make_optimizer
 from metagcttt_core.training.step import gradient_step
 import numpy as np
 import pytest
+from tests.core.agents.slow import batch_of, SlowNetworks
 from tests.core.builders import dataset_at, random_dataset, tiny_agent, weights_of
 import torch
 
 
-def batch_of(agent, size: int = 32):
-    dataset = random_dataset([40, 30], obs_dim=agent.obs_dim, act_dim=agent.act_dim)
-    return agent.relabeller(dataset).sample(size, np.random.default_rng(0))
-
-
-class Slow:
+class Slow(SlowNetworks):
     """Networks and losses for one transition at a time, from exported arrays."""
-
-    def __init__(self, agent):
-        self.w = {k: v.astype(np.float64) for k, v in agent.export_reference_parameters().items()}
-        self.s = agent.settings
-
-    def mlp(self, net, x, head, norm):
-        for layer in range(len(self.s.hidden)):
-            x = x @ self.w[f'{net}.fc{layer}.kernel'] + self.w[f'{net}.fc{layer}.bias']
-            x = 0.5 * x * (1 + np.tanh(math.sqrt(2 / math.pi) * (x + 0.044715 * x**3)))
-            if norm:
-                x = (x - x.mean()) / math.sqrt(x.var() + 1e-6)
-                x = x * self.w[f'{net}.ln{layer}.scale'] + self.w[f'{net}.ln{layer}.bias']
-        return x @ self.w[f'{net}.{head}.kernel'] + self.w[f'{net}.{head}.bias']
 
     def rep(self, net, s, g):
         out = self.mlp(net, np.concatenate([s, g]), 'out', norm=True)
@@ -106,7 +89,7 @@ class Slow:
 )
 def test_losses_equal_a_reference_of_single_transitions(settings):
     agent = tiny_agent('saw', obs_dim=3, **settings)
-    batch = batch_of(agent)
+    batch = batch_of(agent, 32)
     s, n, a = batch['observations'], batch['next_observations'], batch['actions']
     goals, way, sub = batch['actor_goals'], batch['waypoints'], batch['subgoals']
     slow, size = Slow(agent), range(len(s))
@@ -152,7 +135,7 @@ def test_default_settings_are_those_of_the_authors():
 )
 def test_each_loss_trains_its_own_networks(part, trained):
     agent = tiny_agent('saw', const_std=False)
-    batch = agent.tensors(batch_of(agent))
+    batch = agent.tensors(batch_of(agent, 32))
     loss = getattr(agent, f'_{part}_loss')(batch)
     (loss[0] if part == 'actor' else loss).backward()
     got = {n.split('.')[0] for n, w in agent.named_parameters() if w.grad is not None}
@@ -164,7 +147,7 @@ def test_step_moves_what_it_trains(actor_only):
     agent = tiny_agent('saw', tau=0.25)
     before = weights_of(agent)
     parameters = list(agent.trained_parameters(actor_only=actor_only))
-    batch = agent.tensors(batch_of(agent))
+    batch = agent.tensors(batch_of(agent, 32))
     agent.value1.out.bias.data += 1  # targets trail values that are elsewhere
     trailed = agent.target1.out.bias + 0.25 * (agent.value1.out.bias - agent.target1.out.bias)
     gradient_step(
