@@ -1,10 +1,17 @@
 """Base class of all typed settings."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from difflib import get_close_matches
-from typing import Any
+from typing import Any, get_args
 
-from pydantic import BaseModel, ConfigDict, model_validator, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    field_validator,
+    model_validator,
+    ValidationError,
+    ValidationInfo,
+)
 from pydantic_core import ErrorDetails
 
 _LONGEST = 200
@@ -42,6 +49,30 @@ class Settings(BaseModel):
                         f'{cls.__name__} has no setting {key!r}{hint} (known: {known})', str(key)
                     )
         return values
+
+    @field_validator('*', mode='before')
+    @classmethod
+    def _refuse_truth_as_number(cls, value: Any, info: ValidationInfo) -> Any:
+        """YAML reads yes and on as true, which pydantic would take for 1."""
+        kinds = set(_kinds(cls.model_fields[info.field_name or ''].annotation))
+        if kinds & {int, float} and bool not in kinds and _holds_truth(value):
+            raise ValueError('must be a number, not true or false')
+        return value
+
+
+def _kinds(annotation: Any) -> Iterator[Any]:
+    """The types within an annotation, those of containers and unions too."""
+    yield annotation
+    for inner in get_args(annotation):
+        yield from _kinds(inner)
+
+
+def _holds_truth(value: Any) -> bool:
+    if isinstance(value, Mapping):
+        return any(map(_holds_truth, value.values()))
+    if isinstance(value, list | tuple):
+        return any(map(_holds_truth, value))
+    return isinstance(value, bool)
 
 
 def nearest_name(wrong: str, names: Iterable[str]) -> str:

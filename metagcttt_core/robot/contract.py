@@ -109,8 +109,10 @@ class ObservedValue(Numbers):
             raise ValueError(f'transform {self.transform} takes no joints and no size')
         if self.origin and (self.joints or self.transform == 'heading'):
             raise ValueError('headings and joints have no origin')
-        if not self.scale or (self.transform == 'heading' and self.scale != 1):
-            raise ValueError('scale must not be 0, and a heading has none')
+        if self.transform == 'heading' and self.scale != 1:
+            raise ValueError('a heading has no scale')
+        if not 1e-12 <= abs(self.scale) <= 1e12:
+            raise ValueError('scale must be 1e-12 to 1e12, or the negative of that')
         if self.clamp and (self.clamp[0] >= self.clamp[1] or self.transform != 'none'):
             raise ValueError('clamp takes a lower and a higher bound, and no transform')
         return self

@@ -14,6 +14,7 @@ from metagcttt_core.robot.contract import Numbers, ObservedValue
 from metagcttt_core.robot.errors import MessageError
 
 _UNIT_TOLERANCE = 1e-2
+_LARGEST = float(np.finfo(np.float32).max)
 
 
 def read_numbers(value: Numbers, message: Any) -> NDArray[np.float64]:
@@ -39,11 +40,15 @@ def observe(value: ObservedValue, message: Any) -> NDArray[np.float64]:
     """The part of the observation that a message holds, one number for each of `columns`.
 
     Raises:
-        MessageError: As `read_numbers`, or for a quaternion that is not of unit length.
+        MessageError: As `read_numbers`, or for a quaternion that is not of unit length, or a
+            number that single precision cannot hold.
     """
     if value.transform == 'heading':
         return _heading(value.field, message)
-    return transformed(value, read_numbers(value, message))
+    found = transformed(value, read_numbers(value, message))
+    if (np.abs(found) > _LARGEST).any():
+        raise MessageError(f'{value.field} is beyond single precision: {found.tolist()}')
+    return found
 
 
 def transformed(value: ObservedValue, numbers: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from metagcttt_core.files import atomic_write
 import numpy as np
 from pydantic import Field
-from safetensors import safe_open
 from sim_bridge.controllers import LearnedFollower
 from sim_bridge.controllers.training_ground import TrainingGround
 from tqdm import tqdm
@@ -143,29 +140,23 @@ class ControllerTraining:
 
     def save(self) -> None:
         """Write the controller, then the checkpoint, each whole or not at all."""
-        import safetensors.torch
+        from metagcttt_tools.controller.training_state import write_training_state
 
         self.follower().save(self.settings.out / 'controller')
         tensors = {**self.learner.tensors(), **self.replay.tensors()}
-        metadata = {'settings': json.dumps(self.settings.decisive())}
-        with atomic_write(self.settings.checkpoint) as file:
-            file.write(safetensors.torch.save(tensors, metadata))
+        write_training_state(self.settings.checkpoint, self.settings.decisive(), tensors)
 
     def restore(self) -> None:
         """Go on from the checkpoint in OUT.
 
         Raises:
-            ValueError: If it is of a run with other settings; names the first that differs.
+            ValueError: If it is damaged or of a run with other settings; names the first that
+                differs.
         """
+        from metagcttt_tools.controller.training_state import read_training_state
+
         path = self.settings.checkpoint
-        with safe_open(path, framework='pt') as file:
-            stored = json.loads(file.metadata()['settings'])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}
-        for name, asked in self.settings.decisive().items():
-            if stored.get(name) != asked:
-                raise ValueError(
-                    f'{path}: cannot resume, {name} was {stored.get(name)!r} and is now {asked!r}'
-                )
+        tensors = read_training_state(path, self.settings.decisive())
         done = int(tensors['replay.added'])
         if done > self.settings.steps:
             raise ValueError(f'{path}: has {done} steps already, asked for {self.settings.steps}')

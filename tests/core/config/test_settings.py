@@ -55,6 +55,30 @@ def test_unknown_key_is_refused_with_the_nearest_known_one(values, line):
     assert error_lines(error_of(**values)) == [line]
 
 
+class Several(Settings):
+    rates: tuple[float, ...] | None = None
+    limits: dict[str, float] = Field({}, description='bounds by name')
+    fast: bool = False
+    either: bool | int = 1
+    inner: Inner = Inner()
+
+
+@pytest.mark.parametrize(
+    'values',
+    [{'inner': {'rate': True}}, {'rates': [0.5, True]}, {'limits': {'x': False}}],
+)
+def test_true_and_false_are_no_numbers(values):
+    with pytest.raises(ValidationError) as caught:
+        Several(**values)
+    (line,) = error_lines(caught.value)
+    assert 'must be a number, not true or false' in line
+
+
+def test_true_and_false_are_taken_where_they_are_meant():
+    settings = Several(fast=True, either=True, rates=(1, 0.5), inner={'rate': 1})
+    assert (settings.fast, settings.either, settings.rates) == (True, True, (1.0, 0.5))
+
+
 def test_unknown_key_of_another_type_is_refused():
     with pytest.raises(ValidationError, match='has no setting 5'):
         Outer.model_validate({5: 3})

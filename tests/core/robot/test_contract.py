@@ -45,6 +45,7 @@ def test_columns_are_named_in_order():
     ('old', 'new', 'line', 'message'),
     [
         ('rate_hz: 10', 'rate_hz: fast', 3, 'rate_hz: Input should be a valid number'),
+        ('rate_hz: 10', 'rate_hz: yes', 3, 'rate_hz: must be a number, not true or false'),
         ('rate_hz: 10', 'rate_hz: 0', 3, 'rate_hz: Input should be greater than 0, got 0'),
         ('stamp: header', 'stamp: heder', 9, "stamp: Input should be 'header' or 'receive'"),
         ('stamp: header', 'stmp: header', 9, "no setting 'stmp'; did you mean 'stamp'?"),
@@ -128,7 +129,8 @@ def test_files_that_hold_no_contract_are_refused(tmp_path: Path, content, messag
         ('[a, b]}', '[a, b], scale: 2}', 'a.position is measured for commands: it takes no scale'),
         ('fault: hold', 'fault: zeros', 'fallback fault: zeros would drive the positions of data'),
         ('[a, b]}', '[a, b], clamp: [1, 0]}', 'clamp takes a lower and a higher bound'),
-        ('[a, b]}', '[a, b], scale: 0}', 'scale must not be 0'),
+        ('[a, b]}', '[a, b], scale: 0}', 'scale must be 1e-12 to 1e12'),
+        ('[a, b]}', '[a, b], scale: -1.0e+300}', 'scale must be 1e-12 to 1e12'),
     ],
 )
 def test_joints_that_do_not_fit_are_refused(old, new, message):

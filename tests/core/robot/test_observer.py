@@ -47,6 +47,7 @@ def test_heading_is_the_yaw_of_a_rotation_about_x_after_z(observer, roll, yaw):
     ('message', 'reason'),
     [
         (odometry(STEP, x=float('nan')), 'pose.pose.position.x is not finite'),
+        (odometry(STEP, x=1e300), 'pose.pose.position.x is beyond single precision'),
         (odometry(STEP, frame_id='map'), "frame 'map', not 'odom'"),
         (odometry(STEP, quaternion=(0, 0, 0, 0)), 'is no rotation: its length is 0'),
         (odometry(STEP, quaternion=(0, np.sqrt(0.5), 0, np.sqrt(0.5))), 'has no heading'),

@@ -5,6 +5,7 @@ import shutil
 import time
 from typing import Any, Self
 
+from metagcttt_tools.benchmarks.audience import HEADLESS
 from metagcttt_tools.live.scene import viewpoint
 import numpy as np
 import pytest
@@ -20,11 +21,6 @@ needs_chromium = pytest.mark.skipif(
     not (CHROMIUM and DRIVER), reason='no Chromium with a driver here: tools/chromium.sh as root'
 )
 _FIELD_OF_VIEW = np.radians(75)  # vertical
-# As root in a container, and drawn by the processor.
-_OPTIONS = (
-    *('--headless=new', '--no-sandbox', '--disable-dev-shm-usage'),
-    *('--use-angle=swiftshader', '--enable-unsafe-swiftshader'),
-)
 
 
 def drawn_at(
@@ -46,7 +42,7 @@ class Browser:
     def __init__(self, url: str, maze: MazeMap, size: tuple[int, int] = (1000, 560)) -> None:
         options = webdriver.ChromeOptions()
         options.binary_location = CHROMIUM
-        for option in _OPTIONS:
+        for option in HEADLESS:
             options.add_argument(option)
         self._maze = maze
         self.driver = webdriver.Chrome(options=options, service=Service(DRIVER))

@@ -10,13 +10,15 @@ import sys
 import tempfile
 from typing import Literal
 
+from metagcttt_core.files import open_log
+
 Audience = Literal['none', 'reader', 'browser']
 
-# As root in a container, and drawn by the processor.
-_CHROMIUM_OPTIONS = (
-    *('--headless=new', '--no-sandbox', '--disable-dev-shm-usage', '--remote-debugging-port=0'),
-    *('--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--window-size=1000,560'),
+HEADLESS = (
+    *('--headless=new', '--no-sandbox', '--disable-dev-shm-usage'),
+    *('--use-angle=swiftshader', '--enable-unsafe-swiftshader'),
 )
+"""Options of a Chromium that runs as root in a container, and draws by the processor."""
 
 
 @contextmanager
@@ -50,14 +52,18 @@ def watching(audience: Audience, folder: Path) -> Iterator[None]:
 
 @contextmanager
 def _view(folder: Path) -> Iterator[str]:
-    folder.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, '-m', 'metagcttt_tools', 'view', '--out', str(folder)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as view:
+    with (
+        open_log(folder / 'view.log', 'view', anew=True) as log,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True) as view,
+    ):
         assert view.stdout is not None
         try:
             line = view.stdout.readline()
             if not line:
-                raise RuntimeError(f'metagcttt view ended with status {view.wait()}')
+                raise RuntimeError(
+                    f'metagcttt view ended with status {view.wait()}: see {log.name}'
+                )
             yield line.split()[-1]
         finally:
             view.terminate()
@@ -66,8 +72,8 @@ def _view(folder: Path) -> Iterator[str]:
 @contextmanager
 def _browser(url: str) -> Iterator[None]:
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
-        command = ['nice', '-n', '19', 'chromium', *_CHROMIUM_OPTIONS]
-        command += [f'--user-data-dir={profile}', url]
+        command = ['nice', '-n', '19', 'chromium', *HEADLESS, '--remote-debugging-port=0']
+        command += ['--window-size=1000,560', f'--user-data-dir={profile}', url]
         with subprocess.Popen(
             command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         ) as browser:

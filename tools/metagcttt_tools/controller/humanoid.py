@@ -1,14 +1,10 @@
 """Training of the humanoid controller: stages of growing difficulty, many humanoids at once."""
 
 from collections.abc import Callable
-import json
 from pathlib import Path
 from typing import Any
 
-from metagcttt_core.files import atomic_write
 import numpy as np
-from safetensors import safe_open
-import safetensors.torch
 from sim_bridge.controllers.humanoid import (
     ACTION_SIGNS,
     ACTION_SOURCES,
@@ -34,6 +30,7 @@ from metagcttt_tools.controller.recipe import (
 )
 from metagcttt_tools.controller.replay import ReplayBuffer, Returns
 from metagcttt_tools.controller.sac import SAC
+from metagcttt_tools.controller.training_state import read_training_state, write_training_state
 
 
 class HumanoidTraining:
@@ -113,22 +110,15 @@ class HumanoidTraining:
             **{name: torch.from_numpy(array) for name, array in {**ground, **returns}.items()},
             'sweep': torch.tensor(self.sweep),
         }
-        metadata = {'settings': json.dumps(self._decisive())}
-        with atomic_write(self.checkpoint) as file:
-            file.write(safetensors.torch.save(tensors, metadata))
+        write_training_state(self.checkpoint, self._decisive(), tensors)
 
     def restore(self) -> None:
         """Go on from the checkpoint in the folder of the run, to the same end.
 
         Raises:
-            ValueError: If it is of a run with another seed or other stages.
+            ValueError: If it is damaged, or of a run with another seed or other stages.
         """
-        with safe_open(self.checkpoint, framework='pt') as file:
-            stored = json.loads(file.metadata()['settings'])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}
-        for name, asked in self._decisive().items():
-            if stored.get(name) != asked:
-                raise ValueError(f'{self.checkpoint}: cannot resume, it is of other {name}')
+        tensors = read_training_state(self.checkpoint, self._decisive())
         self.learner.load_tensors(tensors)
         for number, weight in enumerate(self.average):
             weight.copy_(tensors[f'average.{number}'])

@@ -1,6 +1,8 @@
 """A node as a process that ends cleanly."""
 
 from collections.abc import Callable
+import faulthandler
+import sys
 import threading
 import time
 from typing import TypeVar
@@ -12,9 +14,12 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from metagcttt.guard import GuardedExecutor
+from metagcttt.parameter_files import warn_of_unused_files
 from metagcttt.signals import ignore_signals, only_set
 
 FAREWELL_S = 0.3
+LONGEST_END_S = 60.0
+"""An end that takes longer hangs: the process says where, and ends."""
 
 AnyNode = TypeVar('AnyNode', bound=Node)
 
@@ -45,10 +50,12 @@ def run(
         except (OSError, ValueError, ParameterException) as error:
             get_logger('metagcttt').fatal(f'cannot start: {error}')
             return 1
+        warn_of_unused_files(node, sys.argv)
         only_set(stop)
         _spin(node, stop, farewell)
     finally:
         rclpy.try_shutdown()
+        faulthandler.cancel_dump_traceback_later()
     return 0
 
 
@@ -62,6 +69,7 @@ def _spin(
             executor.spin_once(timeout_sec=0.1)
     finally:
         ignore_signals()
+        faulthandler.dump_traceback_later(LONGEST_END_S, exit=True)
         if farewell is not None:
             farewell(node)
             end = time.monotonic() + FAREWELL_S
