@@ -1,6 +1,7 @@
 """What computes gradient steps, and which an agent gets."""
 
 from collections.abc import Callable, Sequence
+from functools import cached_property, partial
 from typing import Literal, Protocol
 
 import torch
@@ -80,7 +81,7 @@ class AnalyticEngine:
         optimizer: torch.optim.Optimizer,
         parameters: Sequence[nn.Parameter],
         loss: AnalyticLoss,
-        test_loss: AnalyticLoss,
+        make_test_loss: Callable[[], AnalyticLoss | None],
         *,
         actor_only: bool,
         kernels: Kernels | None = None,
@@ -92,13 +93,14 @@ class AnalyticEngine:
             optimizer: Steps `parameters`.
             parameters: Those that get a gradient.
             loss: The loss of `agent`.
-            test_loss: The same, in memory of its own, which is kept for batches of one size.
+            make_test_loss: Gives the same in memory of its own, which is kept for batches of one
+                size; called where a test loss is asked for.
             actor_only: Train the actor and leave the rest.
             kernels: What the losses compute with, for Adam's steps too.
         """
         self.name = 'analytic' if kernels is None else 'kernels'
         self._agent = agent
-        self._loss, self._test_loss = loss, test_loss
+        self._loss, self._make_test_loss = loss, make_test_loss
         self._actor_only = actor_only
         for parameter, gradient in zip(parameters, loss.gradients, strict=True):
             parameter.grad = gradient
@@ -117,6 +119,12 @@ class AnalyticEngine:
     def test_loss(self, batch: TensorBatch) -> Tensor:
         """See `Engine`."""
         return self._test_loss(batch, backward=False)[0]
+
+    @cached_property
+    def _test_loss(self) -> AnalyticLoss:
+        loss = self._make_test_loss()
+        assert loss is not None
+        return loss
 
 
 def make_engine(
@@ -146,17 +154,17 @@ def make_engine(
     kernels = _kernels_for(name)
     if name != 'eager':
         dtype = torch.bfloat16 if resolved == 'bfloat16' else torch.float32
-        loss, test_loss = (
-            agent.analytic_loss(actor_only=actor_only, dtype=dtype, kernels=kernels)
-            for _ in range(2)
+        make_loss = partial(
+            agent.analytic_loss, actor_only=actor_only, dtype=dtype, kernels=kernels
         )
-        if loss is not None and test_loss is not None:
+        loss = make_loss()
+        if loss is not None:
             return AnalyticEngine(
                 agent,
                 optimizer,
                 parameters,
                 loss,
-                test_loss,
+                make_loss,
                 actor_only=actor_only,
                 kernels=kernels,
             )
