@@ -1,5 +1,7 @@
 """Handlers of Ctrl-C and SIGTERM from start-up on. Imports nothing slow."""
 
+import atexit
+import gc
 import signal
 import threading
 from types import FrameType
@@ -24,6 +26,8 @@ def stop_on_signals() -> threading.Event:
 
     for number in SIGNALS:
         signal.signal(number, end_the_start)
+    # The garbage collection at exit, over all that PyTorch imported, takes seconds.
+    atexit.register(gc.freeze)
     return stop
 
 
