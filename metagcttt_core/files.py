@@ -39,11 +39,14 @@ def atomic_write(path: Path) -> Iterator[IO[bytes]]:
     Missing folders are created. On any failure, `path` keeps its old content.
 
     Raises:
-        FileExistsError: If `path` is a symbolic link: to replace it would be to lose it.
+        FileExistsError: If `path` is a symbolic link, a folder, a pipe or a device: to replace it
+            would be to lose it.
         OSError: If it cannot be written; names it, also where the disk is full.
     """
     if path.is_symlink():
         raise FileExistsError(f'{path} is a symbolic link: move it elsewhere')
+    if path.exists() and not path.is_file():
+        raise FileExistsError(f'{path} exists and is no file: choose another place')
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
     try:

@@ -8,6 +8,9 @@ import numpy as np
 
 from metagcttt_core.data.errors import DatasetError
 
+ROWS = ('observations', 'actions')
+"""Arrays that every dataset has, beside its marks."""
+
 END_MARKS = (
     'timeouts',
     'truncations',
@@ -22,11 +25,20 @@ END_MARKS = (
 _LIKE_A_MARK = re.compile(r'timeout|trunc|termin|done|episode|traj|first|last|start|end|reset')
 _LIKE_A_MARK_OF_ROWS = re.compile(
     r'(?<![a-z])(masks?|discounts?|(time)?steps?|segments?|rollouts?|valids|boundary|boundaries|'
-    r'final|finished|eps|demos?|runs?|ids?|idx|index)(?![a-z])'
+    r'final|finished|eps|demos?|runs?|ids?|idx|index|cont|continues?|continuations?|absorbing|'
+    r'gammas?|seeds?|workers?|envs?|elapsed)(?![a-z])'
 )
-_FOLLOWING = re.compile(r'next_(obs|observations?|states?)|(obs|observations?|states?)_next')
+_LIKE_TIME = re.compile(r'(?<![a-z])(t|times?|(time)?stamps?|clock|seconds|secs|ns)(?![a-z])')
+_LIKE_BOUNDS = re.compile(r'length|lens|size|offset|split|bound|cut|begin')
+_OBSERVED = r'(obs?|observations?|states?)'
+_FOLLOWING = re.compile(
+    rf'(next|new|following|successor)_{_OBSERVED}|{_OBSERVED}_?(next|new|prime|tp1|t1|2)'
+)
 _CHUNK_ROWS = 1 << 20
 _JUMP = 30.0  # times the longest of ordinary steps
+_LARGEST = 1e15  # far beyond any unit; squares of it are finite in single precision
+_FAR = 1e3  # nearer to zero, single precision is finer than any measurement in metres
+_SMALL = 1e-3  # of an action's range, -1 to 1
 _log = logging.getLogger(__name__)
 
 
@@ -34,9 +46,10 @@ def matrix(values: np.ndarray, name: str, where: str) -> np.ndarray:
     """`values` as float32 of shape (rows, dimensions).
 
     Raises:
-        DatasetError: If they are no real numbers of that shape, or not finite.
+        DatasetError: If they are no real numbers of that shape, or not finite, beyond 1e15, or
+            masked.
     """
-    array = np.asanyarray(values)
+    array = unmasked(values, name, where)
     if array.dtype.kind not in 'fiu':
         raise DatasetError(f'{where}: {name} must hold real numbers, got dtype {array.dtype}')
     if array.ndim != 2 or array.shape[1] == 0:
@@ -44,11 +57,11 @@ def matrix(values: np.ndarray, name: str, where: str) -> np.ndarray:
             f'{where}: {name} must have shape (rows, dimensions), got {array.shape}'
         )
     if array.dtype == np.float32:
+        usable(array, name, where)
         return array
     # Checked before narrowing too: a finite double can become infinite in float32.
-    finite(array, name, where)
-    with np.errstate(over='ignore'):
-        narrowed = array.astype(np.float32)
+    usable(array, name, where)
+    narrowed = array.astype(np.float32)
     _warn_of_lost_precision(array, narrowed, name, where)
     return narrowed
 
@@ -62,14 +75,14 @@ def centred(values: np.ndarray, name: str, where: str) -> tuple[np.ndarray, np.n
     Raises:
         DatasetError: As `matrix`.
     """
-    array = np.asanyarray(values)
-    if array.dtype != np.float64 or array.ndim != 2 or len(array) < 2:
+    array = unmasked(values, name, where)
+    if not _is_finer(array) or array.ndim != 2 or len(array) < 2 or array.shape[1] == 0:
         plain = matrix(array, name, where)
+        _warn_of_coarse_numbers(plain, name, where)
         return plain, np.zeros(plain.shape[1])
-    finite(array, name, where)
+    usable(array, name, where)
     origin = np.zeros(array.shape[1])
-    with np.errstate(over='ignore', invalid='ignore'):
-        dims = [dim for dim, _, _ in _lost_precision(array, array.astype(np.float32))]
+    dims = [dim for dim, _, _ in _lost_precision(array, array.astype(np.float32))]
     for dim in dims:
         column = array[:, dim]
         origin[dim] = np.rint(column.min() / 2 + column.max() / 2)
@@ -118,6 +131,39 @@ def finite(array: np.ndarray, name: str, where: str) -> None:
             )
 
 
+def usable(array: np.ndarray, name: str, where: str) -> None:
+    """Refuse numbers that are not finite, or so large that computing with them gives none.
+
+    Raises:
+        DatasetError: With the row of the first.
+    """
+    for start, part in _chunks(array):
+        if -_LARGEST <= float(part.min()) and float(part.max()) <= _LARGEST:  # not with nan
+            continue
+        finite(array, name, where)
+        large = np.abs(part) > _LARGEST
+        row = int(np.flatnonzero(large.any(axis=1))[0])
+        raise DatasetError(
+            f'{where}: {name} is {part[row][large[row]][0]:.3g} in row {start + row}; every '
+            f'value must be within {_LARGEST:g}'
+        )
+
+
+def unmasked(values: np.ndarray, name: str, where: str) -> np.ndarray:
+    """`values` as a plain array.
+
+    Raises:
+        DatasetError: If some are masked, with the row of the first.
+    """
+    array = np.asanyarray(values)
+    if not isinstance(array, np.ma.MaskedArray):
+        return array
+    if np.ma.is_masked(array):
+        row = int(np.argwhere(np.ma.getmaskarray(array))[0][0])
+        raise DatasetError(f'{where}: {name} is masked in row {row}; every value must be there')
+    return np.asarray(array)
+
+
 def looks_like_a_mark(name: str, *, of_rows: bool = False) -> bool:
     """True for the name of an array that may say where trajectories end.
 
@@ -125,13 +171,43 @@ def looks_like_a_mark(name: str, *, of_rows: bool = False) -> bool:
         name: The name.
         of_rows: The array has a value for each row: then numbers of episodes and steps, too.
     """
-    words = re.sub(r'(?<=[a-z])(?=[A-Z])', '_', name).lower()
+    words = _words(name)
     return bool(_LIKE_A_MARK.search(words) or (of_rows and _LIKE_A_MARK_OF_ROWS.search(words)))
+
+
+def looks_like_time(name: str) -> bool:
+    """True for the name of an array that may say when each row was."""
+    return bool(_LIKE_TIME.search(_words(name)))
+
+
+def _words(name: str) -> str:
+    return re.sub(r'(?<=[a-z])(?=[A-Z])', '_', name).lower()
 
 
 def is_following(name: str) -> bool:
     """True for the name of the observations after each row."""
     return bool(_FOLLOWING.fullmatch(name.lower()))
+
+
+def divides_rows(name: str, values: np.ndarray, rows: int) -> bool:
+    """True for whole numbers that divide the rows: lengths of trajectories, or their bounds.
+
+    Args:
+        name: Of the array.
+        values: An array that has no value for each row.
+        rows: How many rows there are.
+    """
+    if not may_divide_rows(values.shape, values.dtype, rows):
+        return False
+    if (values > 0).all() and int(values.sum()) == rows:
+        return True
+    rises = bool((values[1:] > values[:-1]).all()) and values[0] >= 0 and values[-1] <= rows
+    return rises and bool(values[-1] >= rows - 1 or _LIKE_BOUNDS.search(_words(name)))
+
+
+def may_divide_rows(shape: tuple[int, ...], dtype: np.dtype, rows: int) -> bool:
+    """True for the shape and type of what `divides_rows` has to look at."""
+    return len(shape) == 1 and dtype.kind in 'iu' and 1 < shape[0] < rows
 
 
 def take_ends(arrays: dict[str, np.ndarray], where: str) -> np.ndarray:
@@ -158,7 +234,45 @@ def take_ends(arrays: dict[str, np.ndarray], where: str) -> np.ndarray:
                 f'{where}: {name} looks like a mark of trajectories and is not understood: remove '
                 f'it, or give it one of the names {", ".join(END_MARKS)} (true on last rows)'
             )
+    for name in [name for name in arrays if len(arrays[name]) != len(ends)]:
+        if name in ROWS or is_following(name):
+            continue
+        values = arrays.pop(name)
+        if divides_rows(name, values, len(ends)) and not _divides_at(values, ends):
+            raise DatasetError(
+                f'{where}: {name} divides the rows at other places than the marks of ends: mark '
+                f'ends by {", ".join(END_MARKS)} (true on last rows), or remove {name}'
+            )
+    for name, array in arrays.items():
+        row = _starts_again(name, array, ends)
+        if row is not None:
+            raise DatasetError(
+                f'{where}: {name} starts again after row {row}, where no trajectory ends: mark '
+                f'ends by {", ".join(END_MARKS)} (true on last rows), or remove {name}'
+            )
     return ends
+
+
+def _divides_at(values: np.ndarray, ends: np.ndarray) -> bool:
+    """Whether lengths or bounds of trajectories are those of the marked ends."""
+    bounds = np.concatenate([[0], np.flatnonzero(ends) + 1])
+    return np.array_equal(values, np.diff(bounds)) or bool(
+        any(np.isin(values + shift, bounds).all() for shift in (0, 1))
+        and len(values) >= len(bounds) - 2
+    )
+
+
+def _starts_again(name: str, array: np.ndarray, ends: np.ndarray) -> int | None:
+    """The row after which time, or what rises like it, begins again inside a trajectory."""
+    if array.shape not in (ends.shape, (*ends.shape, 1)) or array.dtype.kind not in 'fiu':
+        return None
+    values = array.reshape(-1)
+    falls = (values[1:] < values[:-1]) & ~ends[:-1]
+    if not falls.any():
+        return None
+    is_count = (values[1:][falls] == values[0]).all() and (values[1:] > values[:-1])[~falls].all()
+    is_count = bool(is_count) and bool(falls.sum() < len(falls) / 3)
+    return int(falls.argmax()) if is_count or looks_like_time(name) else None
 
 
 def _is_table(array: np.ndarray, rows: int) -> bool:
@@ -192,6 +306,8 @@ def following_rows(
     Raises:
         DatasetError: With the first row of a transition that leads somewhere else.
     """
+    if following.dtype.kind not in 'fiu':
+        raise DatasetError(f'{where}: {name} must hold real numbers, got dtype {following.dtype}')
     if following.shape != observations.shape:
         raise DatasetError(
             f'{where}: {name} has shape {following.shape}, observations has '
@@ -217,6 +333,13 @@ def warn_of_oddities(
     if largest > 1 + 1e-4:
         _log.warning(
             '%s: actions reach %.3g, beyond -1 to 1: pre-training scales them by the largest',
+            where,
+            largest,
+        )
+    elif 0 < largest < _SMALL:
+        _log.warning(
+            '%s: actions reach only %.3g of the range -1 to 1, too little to be learnt well: '
+            'scale them to it',
             where,
             largest,
         )
@@ -255,14 +378,48 @@ def _warn_of_lost_precision(
 
 
 def _lost_precision(exact: np.ndarray, narrowed: np.ndarray) -> list[tuple[int, float, float]]:
-    """The dimensions that lose more than a twentieth of a step, with loss and median step."""
-    if exact.dtype != np.float64 or len(exact) < 2:
+    """The dimensions that lose more than a twentieth of a step, with loss and usual step."""
+    if not _is_finer(exact) or len(exact) < 2:
         return []
-    part = slice(0, _CHUNK_ROWS)
-    lost = np.abs(exact[part] - narrowed[part]).max(axis=0)
-    steps = np.median(np.abs(np.diff(exact[part], axis=0)), axis=0)
+    part = exact[:_CHUNK_ROWS].astype(np.float64)
+    lost = np.abs(part - narrowed[:_CHUNK_ROWS]).max(axis=0)
+    steps = _usual_steps(part)
     dims = np.flatnonzero((lost > 0.05 * steps) & (steps > 0) & np.isfinite(lost))
     return [(int(dim), float(lost[dim]), float(steps[dim])) for dim in dims]
+
+
+def _usual_steps(part: np.ndarray) -> np.ndarray:
+    """The median change from row to row of each dimension; far from zero, of rows that moved."""
+    changes = np.abs(np.diff(part, axis=0))
+    steps = np.median(changes, axis=0)
+    for dim in np.flatnonzero((steps == 0) & (np.abs(part).max(axis=0) > _FAR)):
+        if (moved := changes[changes[:, dim] > 0, dim]).size:
+            steps[dim] = np.median(moved)
+    return steps
+
+
+def _is_finer(array: np.ndarray) -> bool:
+    """True for types that hold numbers which float32 rounds."""
+    return array.dtype.kind in 'iu' or (array.dtype.kind == 'f' and array.dtype.itemsize > 4)
+
+
+def _warn_of_coarse_numbers(array: np.ndarray, name: str, where: str) -> None:
+    """Log numbers that were stored in single precision and have been rounded by it."""
+    part = array[:_CHUNK_ROWS]
+    if len(part) < 2 or not (far := np.abs(part).max(axis=0) > _FAR).any():
+        return
+    spacing = np.spacing(np.abs(part).max(axis=0))
+    steps = _usual_steps(part)
+    for dim in np.flatnonzero((spacing > 0.05 * steps) & (steps > 0) & far):
+        _log.warning(
+            '%s: %s[:, %d] is stored in steps of %.2g, where it moves by %.2g: store it in double '
+            'precision, or subtract an origin before',
+            where,
+            name,
+            dim,
+            spacing[dim],
+            steps[dim],
+        )
 
 
 def _chunks(array: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:

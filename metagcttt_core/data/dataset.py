@@ -98,8 +98,8 @@ class TrajectoryDataset:
             contract: See the attribute.
 
         Raises:
-            DatasetError: For a wrong rank, length or type, a non-finite value (with its row), or a
-                last row that is not terminal.
+            DatasetError: For a wrong rank, length or type, a value that is not finite, masked or
+                beyond 1e15 (with its row), or a last row that is not terminal.
         """
         where = str(source) if source else 'dataset'
         observations, origin = checks.centred(observations, 'observations', where)
@@ -122,7 +122,7 @@ class TrajectoryDataset:
                 f'{where}: terminals is false on the last row ({rows - 1}); '
                 'the last row of every trajectory must be terminal'
             )
-        for name, array in {'observations': observations, 'actions': actions, **extras}.items():
+        for name, array in extras.items():
             checks.finite(array, name, where)
         checks.warn_of_oddities(observations, actions, terminals, where)
         return cls(

@@ -7,7 +7,13 @@ from typing import Any
 import numpy as np
 
 from metagcttt_core.data.bounds import check_announced, check_memory
-from metagcttt_core.data.checks import END_MARKS, is_following, looks_like_a_mark
+from metagcttt_core.data.checks import (
+    END_MARKS,
+    is_following,
+    looks_like_a_mark,
+    looks_like_time,
+    may_divide_rows,
+)
 from metagcttt_core.data.errors import DatasetError
 
 SUFFIXES = ('.hdf5', '.h5')
@@ -143,6 +149,10 @@ def _mark(group: Any, name: str, num_rows: int, path: Path) -> dict[str, np.ndar
     node = _own_member(group, name)
     shape = getattr(node, 'shape', None)
     of_rows = shape in ((num_rows,), (num_rows, 1))
+    if of_rows and looks_like_time(name) and _is_number(node):
+        return {name: _stored(node, name, path)}
+    if shape and _is_number(node) and may_divide_rows(shape, node.dtype, num_rows):
+        return {name: _stored(node, name, path)}
     if not looks_like_a_mark(name, of_rows=of_rows):
         return {}
     node = _member(group, name, path)
@@ -195,6 +205,10 @@ def _member(group: Any, name: str, path: Path) -> Any:
     if node is None:
         raise DatasetError(f'{path}: {group.name}/{name} is a link, which is not followed')
     return node
+
+
+def _is_number(node: Any) -> bool:
+    return hasattr(node, 'dtype') and node.dtype.kind in 'fiu'
 
 
 def _is_table(node: Any, num_rows: int | None = None) -> bool:

@@ -18,7 +18,7 @@ import zlib
 import numpy as np
 
 from metagcttt_core.data.bounds import check_announced, check_memory
-from metagcttt_core.data.checks import looks_like_a_mark
+from metagcttt_core.data.checks import is_following, looks_like_a_mark, may_divide_rows
 from metagcttt_core.data.errors import DatasetError
 from metagcttt_core.files import atomic_write, claim_folder
 
@@ -129,6 +129,8 @@ def _chosen(path: Path, archive: zipfile.ZipFile, required: Sequence[str]) -> di
         or rows is None
         or (member.shape[:1] == rows and member.dtype.kind in 'bfiu')
         or (member.shape and looks_like_a_mark(name, of_rows=member.shape[:1] == rows))
+        or (member.shape[:1] == rows and is_following(name))
+        or (rows and may_divide_rows(member.shape, member.dtype, rows[0]))
     }
     if left_out := sorted(members.keys() - chosen.keys()):
         _log.info('%s: left out %s, which are no rows of numbers', path, ', '.join(left_out))

@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+from pathlib import Path
 
 from metagcttt_core.files import (
     atomic_write,
@@ -15,6 +16,7 @@ from metagcttt_core.files import (
     remove_claimed,
     weights_name,
     write_json,
+    write_text,
     write_with_weights,
 )
 import pytest
@@ -200,3 +202,13 @@ def test_log_is_opened_again_but_no_file_of_somebody_else(anew, tmp_path):
     with pytest.raises(FileExistsError, match=r'node\.log exists and was not made by metagcttt'):
         open_log(log, 'goal_node', anew=anew)
     assert log.read_text() == '# Four years of work'
+
+
+@pytest.mark.parametrize('make', [Path.mkdir, os.mkfifo])
+def test_what_is_no_file_is_not_replaced(make, tmp_path):
+    path = tmp_path / 'results.json'
+    make(path)
+    with pytest.raises(FileExistsError, match=r'results\.json exists and is no file'):
+        write_text(path, 'new')
+    assert not path.is_file()
+    assert list(tmp_path.iterdir()) == [path]

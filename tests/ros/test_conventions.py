@@ -13,8 +13,14 @@ from metagcttt.sim.node import SimBridgeNode
 from metagcttt.visualization.node import VisualizationNode
 from metagcttt_interfaces.msg import MazeState, PolicyStatus
 import pytest
-from rcl_interfaces.msg import Log
-from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
+from rcl_interfaces.msg import Log, ParameterValue
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import (
+    GetParameters,
+    ListParameters,
+    SetParameters,
+    SetParametersAtomically,
+)
 from rclpy.parameter import Parameter, parameter_dict_from_yaml_file, parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 import yaml
@@ -186,3 +192,30 @@ def test_number_as_text_is_a_number_only_where_one_is_declared(graph: Graph) -> 
     )
     assert [result.successful for result in results] == [True, False, False, False]
     assert node.get_parameter('speed_factor').value == 2.0
+
+
+def test_each_parameter_of_a_request_is_answered_for_by_name(
+    graph: Graph, dataset_file: Path
+) -> None:
+    graph.add(GoalNode, dataset=str(dataset_file))
+    asked = [
+        ParameterMessage(name='max_steps', value=ParameterValue(type=200)),
+        ParameterMessage(name='', value=ParameterValue(type=2, integer_value=1)),
+        ParameterMessage(name='max_step', value=ParameterValue(type=2, integer_value=1)),
+        ParameterMessage(name='max_steps', value=ParameterValue(type=2, integer_value=77)),
+    ]
+    told = graph.call(
+        SetParameters, 'goal_node/set_parameters', SetParameters.Request(parameters=asked)
+    ).results
+    assert [result.successful for result in told] == [False, False, False, True]
+    assert 'max_steps has the type 200' in told[0].reason
+    assert told[1].reason == "there is no parameter ''"
+    assert told[2].reason == "there is no parameter 'max_step'; did you mean max_steps?"
+    asked[3].value.integer_value = 78
+    for wrong, reason in zip(asked[:3], [result.reason for result in told[:3]], strict=True):
+        both = SetParametersAtomically.Request(parameters=[asked[3], wrong])
+        result = graph.call(
+            SetParametersAtomically, 'goal_node/set_parameters_atomically', both
+        ).result
+        assert (result.successful, result.reason) == (False, reason)
+    assert dump(graph, 'goal_node')['max_steps'] == 77

@@ -1,6 +1,7 @@
 """What a file says about its trajectories is used or refused; what looks wrong is logged."""
 
 import logging
+import re
 
 from metagcttt_core import DatasetError, TrajectoryDataset
 from metagcttt_core.data.checks import END_MARKS
@@ -51,6 +52,9 @@ def test_trajectories_end_at_every_mark(tmp_path, name, dtype):
         ('timesteps', np.arange(60) % 30),
         ('runId', np.array(['a', 'b']).repeat(30)),
         ('valids', (1 - flags(29, 59))[:, None]),
+        ('continues', ~flags(29, 59)),
+        ('absorbing', flags(29, 59)),
+        ('worker', np.arange(60) // 30),
     ],
 )
 def test_unknown_mark_is_refused_by_name(tmp_path, name, array):
@@ -72,6 +76,48 @@ def test_mark_that_tells_nothing_new_is_left_out(tmp_path, name, array):
     path = saved(tmp_path, timeouts=flags(29), **{name: array})
     dataset = TrajectoryDataset.load(path)
     assert (dataset.episode_ends.tolist(), dataset.extras) == ([29, 59], {})
+
+
+@pytest.mark.parametrize(
+    ('name', 'values'),
+    [
+        ('lengths', [30, 30]),
+        ('num_rows_of_each', [20, 40]),
+        ('splits', [0, 30, 60]),
+        ('offsets', [0, 30]),
+        ('last_of_each', [29, 59]),
+    ],
+)
+def test_lengths_and_bounds_of_other_trajectories_are_refused(tmp_path, name, values):
+    path = saved(tmp_path, **{name: np.array(values)})
+    with pytest.raises(DatasetError, match=rf'data\.npz: {name} (divides the rows|looks like)'):
+        TrajectoryDataset.load(path)
+
+
+@pytest.mark.parametrize('values', [[30, 30], [0, 30, 60], [29, 59], [30, 60]])
+def test_lengths_and_bounds_of_the_same_trajectories_are_left_out(tmp_path, values):
+    path = saved(tmp_path, timeouts=flags(29), lengths=np.array(values))
+    dataset = TrajectoryDataset.load(path)
+    assert (dataset.episode_ends.tolist(), dataset.extras) == ([29, 59], {})
+
+
+@pytest.mark.parametrize(
+    ('name', 'values'),
+    [
+        ('time', 0.1 * (np.arange(60) % 30) + np.random.default_rng(0).uniform(0, 0.01, 60)),
+        ('wall_clock', 10.0 - np.arange(60)),
+        ('counted', np.arange(60) % 30),
+    ],
+)
+def test_time_that_starts_again_is_refused_where_no_trajectory_ends(tmp_path, name, values):
+    with pytest.raises(DatasetError, match=f'{name} starts again after row (29|0)'):
+        TrajectoryDataset.load(saved(tmp_path, **{name: values}))
+
+
+def test_time_that_starts_again_with_each_trajectory_is_kept(tmp_path):
+    times = {'time': 0.1 * (np.arange(60) % 30), 'yaw': np.arange(60) % 30 - 15.0}
+    dataset = TrajectoryDataset.load(saved(tmp_path, timeouts=flags(29), **times))
+    assert set(dataset.extras) == {'time', 'yaw'}
 
 
 def test_several_numbers_a_row_are_no_mark(tmp_path):
@@ -111,7 +157,7 @@ def test_next_observations_in_another_order_are_refused(tmp_path):
     rows = walk()
     following = np.vstack([rows['observations'][1:], rows['observations'][-1:]])
     shuffled = {name: array[order] for name, array in rows.items()}
-    for name in ('next_observations', 'next_obs', 'observations_next', 'next_state'):
+    for name in ('next_observations', 'next_obs', 'observations_next', 'next_state', 'obs2'):
         path = saved(tmp_path, **shuffled, **{name: following[order]})
         with pytest.raises(DatasetError, match=f'{name} of row 0 is not observation 1'):
             TrajectoryDataset.load(path)
@@ -144,3 +190,54 @@ def test_ordinary_content_is_not_remarked_upon(tmp_path, caplog):
         TrajectoryDataset.load(saved(tmp_path, timeouts=flags(29)))
         TrajectoryDataset.load(saved(tmp_path, timeouts=flags(29), observations=two_walks()))
     assert caplog.records == []
+
+
+@pytest.mark.parametrize('name', ['observations', 'actions'])
+@pytest.mark.parametrize('value', [3e38, -2e15])
+def test_numbers_beyond_all_units_are_refused_by_row(tmp_path, name, value):
+    rows = walk()[name]
+    rows[7, 1] = value
+    told = re.escape(f'{name} is {value:.3g} in row 7; every value must be within 1e+15')
+    with pytest.raises(DatasetError, match=told):
+        TrajectoryDataset.load(saved(tmp_path, **{name: rows}))
+
+
+def test_masked_values_are_refused_by_row():
+    rows = walk()
+    rows['observations'] = np.ma.masked_array(rows['observations'], rows['actions'] == 2)
+    assert type(TrajectoryDataset.from_arrays(**rows, terminals=flags(59)).observations) is (
+        np.ndarray
+    )
+    rows['observations'][5, 0] = np.ma.masked
+    with pytest.raises(DatasetError, match='observations is masked in row 5'):
+        TrajectoryDataset.from_arrays(**rows, terminals=flags(59))
+
+
+def test_actions_far_below_their_range_are_logged(tmp_path, caplog):
+    with caplog.at_level(logging.WARNING):
+        TrajectoryDataset.load(saved(tmp_path, actions=1e-30 * walk()['actions']))
+    assert 'data.npz: actions reach only 9.' in caplog.text
+    caplog.clear()
+    TrajectoryDataset.load(saved(tmp_path, actions=0 * walk()['actions']))
+    assert caplog.records == []
+
+
+@pytest.mark.parametrize('dtype', [np.int64, np.int32, np.longdouble])
+def test_far_whole_numbers_are_counted_from_an_origin(tmp_path, dtype):
+    millimetres = (500_000_000 + np.round(1000 * walk()['observations'])).astype(dtype)
+    dataset = TrajectoryDataset.load(saved(tmp_path, observations=millimetres))
+    assert np.array_equal(dataset.states(slice(None)), millimetres)
+
+
+def test_far_robot_that_mostly_stands_keeps_its_precision(tmp_path):
+    standing = 5e6 + np.repeat(walk()['observations'].astype(np.float64), 3, axis=0)
+    rows = {'actions': np.zeros((180, 2)), 'terminals': flags(179, total=180)}
+    dataset = TrajectoryDataset.load(saved(tmp_path, observations=standing, **rows))
+    assert np.abs(dataset.states(slice(None)) - standing).max() < 1e-6
+
+
+def test_coordinates_that_single_precision_has_rounded_are_logged(tmp_path, caplog):
+    far = (5e6 + walk()['observations']).astype(np.float32)
+    with caplog.at_level(logging.WARNING):
+        TrajectoryDataset.load(saved(tmp_path, observations=far))
+    assert 'observations[:, 0] is stored in steps of 0.5, where it moves by 0.5' in caplog.text

@@ -325,6 +325,8 @@ def test_d4rl_file_ends_trajectories_by_terminals_and_timeouts(tmp_path):
         ({'is_last': np.zeros(9, bool)}, 'is_last looks like a mark of trajectories'),
         ({'infos/episode_id': np.zeros(9)}, 'episode_id looks like a mark of trajectories'),
         ({'infos/run': np.arange(9) // 6}, 'run looks like a mark of trajectories'),
+        ({'lengths': np.array([5, 4])}, 'lengths divides the rows at other places'),
+        ({'infos/time': np.arange(9) % 6}, 'time starts again after row 5'),
         ({'next_obs': np.ones((9, 4))}, 'next_obs of row 0 is not observation 1'),
         ({'actions': np.zeros((8, 2))}, 'actions has 8 rows but observations has 9'),
         ({'actions': np.zeros(9)}, 'actions must be numbers of shape'),

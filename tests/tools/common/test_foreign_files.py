@@ -1,6 +1,7 @@
 """No program overwrites files of somebody else, nor follows a link to them."""
 
 from collections.abc import Callable
+import os
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -88,6 +89,30 @@ def test_foreign_file_is_named_and_kept(program, arguments, name, linked, data, 
     assert there.read_text() == PRECIOUS
     left = [path for path in sorted(tmp_path.iterdir()) if path.suffix != '.lock']
     assert left == before
+
+
+IMPORTERS = [(program, given) for program, given, _ in PROGRAMS if 'DIR/run.npz' in given]
+
+
+@pytest.mark.parametrize('kind', ['file', 'folder', 'pipe', 'link', 'dataset'])
+@pytest.mark.parametrize(('program', 'arguments'), IMPORTERS)
+def test_overwriting_replaces_imported_datasets_only(program, arguments, kind, tmp_path, capsys):
+    there, elsewhere = tmp_path / 'run.npz', tmp_path / 'elsewhere'
+    elsewhere.write_text(PRECIOUS)
+    make = {
+        'file': lambda: there.write_text(PRECIOUS),
+        'folder': there.mkdir,
+        'pipe': lambda: os.mkfifo(there),
+        'link': lambda: there.symlink_to(elsewhere),
+        'dataset': lambda: maze_walks().save(there),
+    }
+    make[kind]()
+    before = there.lstat().st_ino, there.lstat().st_mtime_ns
+    with pytest.raises(SystemExit, match='2'):
+        program([*arguments.replace('DIR', str(tmp_path)).split(), '--overwrite'])
+    assert f'{there} exists and is no imported dataset' in capsys.readouterr().err
+    assert (there.lstat().st_ino, there.lstat().st_mtime_ns) == before
+    assert elsewhere.read_text() == PRECIOUS
 
 
 def test_what_the_study_report_writes_is_not_taken_from_anybody(tmp_path, monkeypatch, capsys):

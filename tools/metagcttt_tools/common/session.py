@@ -135,14 +135,25 @@ def ours_or_fail(record: Path, *others: Path) -> None:
 
 @contextmanager
 def writes_dataset(path: Path, overwrite: bool) -> Iterator[None]:
-    """As `sole_writer`, for a dataset that is only replaced on request.
+    """As `sole_writer`, for a dataset that is only replaced on request, and if it is one of ours.
 
     Raises:
         SystemExit: With status 2, also if it exists and is not to be overwritten.
     """
+    from metagcttt_core.data import DatasetError
+    from metagcttt_core.data.dataset import MADE_FROM
+    from metagcttt_core.data.npz import read_json
+
     with sole_writer(path):
         if path.exists() and not overwrite:
             fail(f'{path} exists: give --overwrite or another --out')
+        if os.path.lexists(path):
+            try:
+                is_ours = not path.is_symlink() and path.is_file() and read_json(path, MADE_FROM)
+            except DatasetError:
+                is_ours = None
+            if not is_ours:
+                fail(f'{path} exists and is no imported dataset: move it elsewhere')
         yield
 
 

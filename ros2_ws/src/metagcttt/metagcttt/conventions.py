@@ -9,7 +9,9 @@ import re
 from typing import Any
 
 from metagcttt_core.config.settings import nearest_name
+from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -62,11 +64,53 @@ class ConventionalNode(Node):
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """Set all parameters or none; those that have their value already are left alone."""
+        for name in (parameter.name for parameter in parameter_list):
+            if not self.has_parameter(name):
+                reason = f'there is no parameter {name[:MAX_NAME]!r}{self._hint(name)}'
+                return SetParametersResult(successful=False, reason=reason)
         asked = [self._as_declared(parameter) for parameter in parameter_list]
         changes = [parameter for parameter in asked if not self._has(parameter)]
         if not changes:
             return SetParametersResult(successful=True)
         return super().set_parameters_atomically(changes)
+
+    def create_service(self, srv_type: Any, srv_name: str, callback: Any, **kwargs: Any) -> Any:
+        """Create a service; those that set parameters answer for each, whatever is asked."""
+        ours = {
+            SetParameters: self._answer_set_parameters,
+            SetParametersAtomically: self._answer_set_parameters_atomically,
+        }
+        return super().create_service(srv_type, srv_name, ours.get(srv_type, callback), **kwargs)
+
+    def _answer_set_parameters(
+        self, request: SetParameters.Request, response: SetParameters.Response
+    ) -> SetParameters.Response:
+        response.results = [self._set_from_messages([each]) for each in request.parameters]
+        return response
+
+    def _answer_set_parameters_atomically(
+        self, request: SetParametersAtomically.Request, response: SetParametersAtomically.Response
+    ) -> SetParametersAtomically.Response:
+        response.result = self._set_from_messages(request.parameters)
+        return response
+
+    def _set_from_messages(self, messages: list[ParameterMessage]) -> SetParametersResult:
+        known = {kind.value for kind in Parameter.Type}
+        for message in messages:
+            if message.value.type not in known:
+                reason = (
+                    f'{message.name[:MAX_NAME]} has the type {message.value.type}, which there is '
+                    f'not: 0 to {max(known)} are accepted'
+                )
+                return SetParametersResult(successful=False, reason=reason)
+        return self.set_parameters_atomically(
+            [Parameter.from_parameter_msg(message) for message in messages]
+        )
+
+    def _hint(self, name: str) -> str:
+        """What may have been meant by the name of a parameter that there is not."""
+        near = nearest_name(name[:MAX_NAME], self.get_parameters_by_prefix(''))
+        return f'; did you mean {near}?' if near else ''
 
     def _as_declared(self, parameter: Parameter) -> Parameter:
         """A number as text becomes a number: the tools read 1e-05 so, and write it so."""
@@ -95,9 +139,9 @@ class ConventionalNode(Node):
             if ('parameter', name) in self._told or later:
                 continue
             self._told.add(('parameter', name))
-            near = nearest_name(name, own)
-            hint = f'; did you mean {near}?' if near else ''
-            self.get_logger().warning(f'there is no parameter {name}, it is ignored{hint}')
+            self.get_logger().warning(
+                f'there is no parameter {name}, it is ignored{self._hint(name)}'
+            )
 
     # --- topics ------------------------------------------------------------------------------
 
