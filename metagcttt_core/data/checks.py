@@ -1,6 +1,6 @@
 """Checks of what a dataset file says, before anything is trained on it."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 import logging
 import re
 
@@ -119,16 +119,30 @@ def finite(array: np.ndarray, name: str, where: str) -> None:
     Raises:
         DatasetError: With the row of the first.
     """
+    if found := _not_finite(array):
+        row, value = found
+        raise DatasetError(f'{where}: {name} is {value} in row {row}; every value must be finite')
+
+
+def without_gaps(extras: Mapping[str, np.ndarray], where: str) -> dict[str, np.ndarray]:
+    """The arrays of a file that nothing needs, but for those with nan or inf, which are logged."""
+    found = {name: _not_finite(array) for name, array in extras.items()}
+    for name, place in found.items():
+        if place:
+            _log.warning('%s: %s is left out, it is %s in row %d', where, name, place[1], place[0])
+    return {name: array for name, array in extras.items() if not found[name]}
+
+
+def _not_finite(array: np.ndarray) -> tuple[int, float] | None:
+    """Row and value of the first number that is not finite."""
     if array.dtype.kind != 'f':
-        return
+        return None
     for start, part in _chunks(array):
         good = np.isfinite(part).reshape(len(part), -1)
         if not good.all():
             row = int(np.flatnonzero(~good.all(axis=1))[0])
-            value = part[row].reshape(-1)[~good[row]][0]
-            raise DatasetError(
-                f'{where}: {name} is {value} in row {start + row}; every value must be finite'
-            )
+            return start + row, part[row].reshape(-1)[~good[row]][0]
+    return None
 
 
 def usable(array: np.ndarray, name: str, where: str) -> None:

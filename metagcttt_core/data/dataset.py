@@ -167,8 +167,9 @@ class TrajectoryDataset:
         contract = made_from = None
         if not minari.is_minari(path):
             contract, made_from = (npz.read_json(path, name) for name in (CONTRACT, MADE_FROM))
+        extras = checks.without_gaps(arrays, str(path))
         dataset = cls.from_arrays(
-            observations, actions, ends, arrays, source=path, contract=contract
+            observations, actions, ends, extras, source=path, contract=contract
         )
         dataset.made_from = made_from
         for name, states in following.items():

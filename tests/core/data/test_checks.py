@@ -125,6 +125,20 @@ def test_several_numbers_a_row_are_no_mark(tmp_path):
     assert set(dataset.extras) == {'end_effector'}
 
 
+def test_what_nothing_needs_is_left_out_where_it_has_gaps(tmp_path, caplog):
+    rewards = np.zeros(20, np.float32)
+    rewards[3] = np.nan
+    rows = {'observations': np.zeros((20, 2)), 'actions': np.zeros((20, 1))}
+    marks = {'terminals': np.arange(20) % 10 == 9}
+    np.savez(
+        tmp_path / 'walk.npz', **rows, **marks, rewards=rewards, costs=rewards[4:5].repeat(20)
+    )
+    with caplog.at_level(logging.WARNING):
+        dataset = TrajectoryDataset.load(tmp_path / 'walk.npz')
+    assert set(dataset.extras) == {'costs'}
+    assert 'walk.npz: rewards is left out, it is nan in row 3' in caplog.text
+
+
 def test_jumps_of_short_trajectories_are_logged(tmp_path, caplog):
     rows = np.vstack([walk(12, seed, 9.0 * seed)['observations'] for seed in range(5)])
     with caplog.at_level(logging.WARNING):
