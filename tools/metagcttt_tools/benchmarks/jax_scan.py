@@ -64,10 +64,11 @@ def jax_inner_loop(
         target = jax.lax.stop_gradient(
             batch['rewards'] + settings.discount * batch['masks'] * following.squeeze(-1)
         )
-        critic = sum(
-            jnp.square(network(name, weights, *states, batch['actions']).squeeze(-1) - target)
+        critics = [
+            network(name, weights, *states, batch['actions']).squeeze(-1)
             for name in ('critic1', 'critic2')
-        ).mean()
+        ]
+        critic = jnp.square(jnp.stack(critics) - target).sum(0).mean()
         return value + critic + actor
 
     def step(carry: Any, batch: Any) -> Any:
