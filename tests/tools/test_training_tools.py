@@ -90,6 +90,28 @@ def test_policy_of_a_robot_is_for_no_maze(tmp_path, capsys):
         )
 
 
+@pytest.mark.parametrize('program', ['import-table', 'import-lerobot'])
+def test_policy_of_imported_data_is_for_no_maze_unless_one_is_named(program, tmp_path, capsys):
+    data, walks = tmp_path / 'table.npz', maze_walks()
+    walks.made_from = {'program': program, 'sources': []}
+    walks.save(data)
+
+    def environment(out, *flags):
+        pretrain.main([*pretrain_arguments(data, tmp_path / out, steps=1), *flags])
+        return load_checkpoint(tmp_path / out / 'checkpoint').metadata.get('environment')
+
+    assert environment('none') is None
+    named = ('--environment', 'pointmaze-large-v0')
+    assert environment('named', *named) == 'pointmaze-large-v0'
+    with pytest.raises(SystemExit, match='2'):
+        environment('no', '--evaluate-every', '1')
+    error = capsys.readouterr().err
+    assert f'made by {program}, which does not say of which simulator: evaluate_every' in error
+    with pytest.raises(SystemExit, match='2'):
+        evaluate.main(['--checkpoints', str(tmp_path / 'none/checkpoint'), '--dataset', str(data)])
+    assert 'does not say which environment it is for' in capsys.readouterr().err
+
+
 def test_pretrain_does_not_overwrite_a_checkpoint(dataset_path, base, capsys):
     with pytest.raises(SystemExit, match='2'):
         pretrain.main(pretrain_arguments(dataset_path, base.parent, steps=20))
