@@ -148,6 +148,44 @@ def test_meta_train_changes_the_policy_and_keeps_its_history(
     assert last['task/support_transitions'] > 0
 
 
+def test_meta_train_retrieves_by_the_contract_of_the_data(dataset_path, base, tmp_path, capsys):
+    walks = maze_walks()
+    walks.contract = {**contract().identity, 'position_dims': [1], 'epsilon': 0.4}
+    walks.save(tmp_path / 'robot.npz')
+
+    def train(out, data, *flags):
+        meta_train.main([*meta_arguments(data, base, tmp_path / out, steps=2), *flags])
+        history = load_checkpoint(tmp_path / out / 'checkpoint').metadata['history']
+        return history[-1]['meta']['filter'], weights(tmp_path / out / 'checkpoint')
+
+    found, robot = train('robot', tmp_path / 'robot.npz')
+    assert (found['position_dims'], found['epsilon']) == ([1], 0.4)
+    flags = ('--meta.filter.position-dims', '1', '--meta.filter.epsilon', '0.4')
+    same, maze = train('maze', dataset_path, *flags)
+    assert same == found
+    assert_same_bits(robot, maze)
+    usual, other = train('usual', dataset_path)
+    assert (usual['position_dims'], usual['epsilon']) == ([0, 1], 1.0)
+    assert not all(torch.equal(other[name], tensor) for name, tensor in robot.items())
+    with pytest.raises(SystemExit, match='2'):
+        train('no', tmp_path / 'robot.npz', '--meta.filter.scale', '1', '1')
+    assert (
+        'scale must have one factor per position dimension (1), got 2' in capsys.readouterr().err
+    )
+
+
+def test_run_from_before_contracts_decided_is_continued(dataset_path, base, tmp_path):
+    """Its settings name the radius and the coordinates that were the defaults."""
+    out = tmp_path / 'run'
+    meta_train.main(meta_arguments(dataset_path, base, out, steps=2))
+    record = json.loads((out / 'settings.json').read_text())
+    record['settings']['meta']['filter'] |= {'epsilon': 1.0, 'position_dims': [0, 1]}
+    (out / 'settings.json').write_text(json.dumps(record))
+    meta_train.main([*meta_arguments(dataset_path, base, out, steps=4), '--resume'])
+    meta_train.main(meta_arguments(dataset_path, base, tmp_path / 'whole', steps=4))
+    assert_same_bits(weights(out / 'checkpoint'), weights(tmp_path / 'whole' / 'checkpoint'))
+
+
 @pytest.mark.parametrize(
     ('algorithm', 'rate'), [('continual', 1.0), ('fomaml', 3e-4), ('maml', 3e-4), ('reptile', 0.1)]
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from metagcttt_core import DatasetError, MetaConfig, TrajectoryDataset
+from metagcttt_core import MetaConfig, TrajectoryDataset
 from metagcttt_core.agents.config import ActorLoss
 from pydantic import Field
 
@@ -63,14 +63,13 @@ class MetaTrainSettings(RunSettings):
 def main(argv: list[str] | None = None) -> None:
     """Run the program."""
     settings = parse(MetaTrainSettings, _DESCRIPTION, 'meta-train', argv)
-    from metagcttt_core import CheckpointError
-    from metagcttt_core.meta import DivergedError, TaskError
+    from metagcttt_core.meta import DivergedError
 
     use_threads(settings.threads)
     try:
         with process_group(settings.device):
             _run(settings)
-    except (DatasetError, CheckpointError, TaskError) as error:
+    except ValueError as error:
         fail(str(error))
     except DivergedError as error:
         fail(f'{error}; {left_behind(settings)}')
@@ -86,6 +85,8 @@ def _run(settings: MetaTrainSettings) -> None:
     base = load_checkpoint(settings.checkpoint, changes=changes).to(settings.device)
     dataset = TrajectoryDataset.load(settings.dataset)
     decisive = settings.decisive()
+    in_force = settings.meta.filter.on(dataset.contract).model_dump(mode='json')
+    decisive |= {f'meta.filter.{name}': value for name, value in in_force.items()}
     decisive |= {'dataset': dataset.fingerprint, 'checkpoint': base.fingerprint()}
     base.metadata['history'] = [
         *base.metadata.get('history', []),
