@@ -174,6 +174,26 @@ def test_meta_train_retrieves_by_the_contract_of_the_data(dataset_path, base, tm
     )
 
 
+def test_policy_of_another_contract_is_refused_by_name(base, tmp_path, capsys):
+    agent, walks = load_checkpoint(base), maze_walks()
+    agent.metadata['contract'] = contract().identity
+    save_checkpoint(agent, tmp_path / 'cart')
+    walks.contract = {'robot': 'van', 'fingerprint': 'other'}
+    data = tmp_path / 'van.npz'
+    walks.save(data)
+    arguments = ['--checkpoints', str(tmp_path / 'cart'), '--dataset', str(data)]
+    for program, given in (
+        (meta_train, meta_arguments(data, tmp_path / 'cart', tmp_path / 'no', steps=1)),
+        (evaluate, ['--offline', *arguments, '--steps-ahead', '5', '--processes', '1']),
+    ):
+        with pytest.raises(SystemExit, match='2'):
+            program.main(given)
+        error = capsys.readouterr().err
+        assert f'the policy {tmp_path}/cart was made for cart (contract ' in error
+        assert f'not for van (contract other), as the dataset {data} is' in error
+    assert not (tmp_path / 'no' / 'checkpoint').exists()
+
+
 def test_run_from_before_contracts_decided_is_continued(dataset_path, base, tmp_path):
     """Its settings name the radius and the coordinates that were the defaults."""
     out = tmp_path / 'run'
