@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 
 from metagcttt_core.adaptation.config import InnerLoopConfig
 from metagcttt_core.meta.registry import META_UPDATES
-from metagcttt_core.retrieval.config import FilterConfig
+from metagcttt_core.retrieval.config import FilterSettings
 
 if TYPE_CHECKING:
     Algorithm = str
@@ -49,7 +49,7 @@ class MetaConfig(InnerLoopConfig):
         '(test-gradient), or nothing (reject)',
     )
     meta_batch_size: int = Field(1, ge=1, description='tasks per outer step B')
-    filter: FilterConfig = FilterConfig()
+    filter: FilterSettings = FilterSettings()
 
     @model_validator(mode='after')
     def _meta_lr_fits_the_algorithm(self) -> Self:

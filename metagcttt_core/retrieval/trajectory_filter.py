@@ -7,7 +7,7 @@ import time
 import numpy as np
 
 from metagcttt_core.data.dataset import TrajectoryDataset
-from metagcttt_core.retrieval.config import FilterConfig
+from metagcttt_core.retrieval.config import FilterConfig, FilterSettings
 from metagcttt_core.retrieval.peaks import ranges
 from metagcttt_core.retrieval.registry import VARIANTS
 from metagcttt_core.retrieval.spatial_index import Ball, SpatialIndex
@@ -28,19 +28,21 @@ class TrajectoryFilter:
     def __init__(
         self,
         dataset: TrajectoryDataset,
-        config: FilterConfig | None = None,
+        config: FilterSettings | None = None,
     ) -> None:
         """Index `dataset` by its positions.
 
         Args:
             dataset: The offline dataset D.
-            config: Selection rule and its settings.
+            config: Selection rule and its settings; what `FilterSettings`, the default, leave out
+                is that of the dataset's contract.
 
         Raises:
-            ValueError: If a position dimension is not one of the dataset's observation dimensions.
+            ValueError: If a position dimension is not one of the dataset's observation dimensions,
+                or `scale` does not fit them.
         """
         self.dataset = dataset
-        self.config = config or FilterConfig()
+        self.config: FilterConfig = (config or FilterSettings()).on(dataset.contract)
         if max(self.config.position_dims) >= dataset.obs_dim:
             raise ValueError(
                 f'position_dims {self.config.position_dims} must be below the width of an '

@@ -65,6 +65,20 @@ def test_figures_tell_the_better_policy(folder, tmp_path, capsys):
     assert (tmp_path / 'offline.png').read_bytes().startswith(b'\x89PNG')
 
 
+def test_contract_of_the_data_decides_about_distances(folder, tmp_path):
+    data = TrajectoryDataset.load(folder / 'walks.npz')
+    data.contract = {'robot': 'cart', 'position_dims': [1], 'epsilon': 0.5}
+    data.save(tmp_path / 'robot.npz')
+    robot = evaluate(folder, tmp_path / 'a.json', '--dataset', str(tmp_path / 'robot.npz'))
+    assert {row['epsilon'] for row in robot['results']} == {0.5}
+    flags = ('--filter.epsilon', '0.5', '--filter.position-dims', '1')
+    same = evaluate(folder, tmp_path / 'b.json', *flags)
+    assert same['results'] == robot['results']
+    usual = evaluate(folder, tmp_path / 'c.json')
+    assert {row['epsilon'] for row in usual['results']} == {1.0}
+    assert usual['results'][1]['support'] != robot['results'][1]['support']
+
+
 def test_grid_ranks_all_settings(folder, tmp_path, capsys):
     grid = ('--grid', '--epsilons', '0.001', '4', '--lrs', '0.001', '0.01')
     report = evaluate(folder, tmp_path / 'offline.json', *grid)

@@ -90,6 +90,28 @@ def test_policy_of_a_robot_is_for_no_maze(tmp_path, capsys):
         )
 
 
+@pytest.mark.parametrize('program', ['import-table', 'import-lerobot'])
+def test_policy_of_imported_data_is_for_no_maze_unless_one_is_named(program, tmp_path, capsys):
+    data, walks = tmp_path / 'table.npz', maze_walks()
+    walks.made_from = {'program': program, 'sources': []}
+    walks.save(data)
+
+    def environment(out, *flags):
+        pretrain.main([*pretrain_arguments(data, tmp_path / out, steps=1), *flags])
+        return load_checkpoint(tmp_path / out / 'checkpoint').metadata.get('environment')
+
+    assert environment('none') is None
+    named = ('--environment', 'pointmaze-large-v0')
+    assert environment('named', *named) == 'pointmaze-large-v0'
+    with pytest.raises(SystemExit, match='2'):
+        environment('no', '--evaluate-every', '1')
+    error = capsys.readouterr().err
+    assert f'made by {program}, which does not say of which simulator: evaluate_every' in error
+    with pytest.raises(SystemExit, match='2'):
+        evaluate.main(['--checkpoints', str(tmp_path / 'none/checkpoint'), '--dataset', str(data)])
+    assert 'does not say which environment it is for' in capsys.readouterr().err
+
+
 def test_pretrain_does_not_overwrite_a_checkpoint(dataset_path, base, capsys):
     with pytest.raises(SystemExit, match='2'):
         pretrain.main(pretrain_arguments(dataset_path, base.parent, steps=20))
@@ -124,6 +146,64 @@ def test_meta_train_changes_the_policy_and_keeps_its_history(
     last = json.loads((tmp_path / 'metrics.jsonl').read_text().splitlines()[-1])
     assert last['step'] == 4
     assert last['task/support_transitions'] > 0
+
+
+def test_meta_train_retrieves_by_the_contract_of_the_data(dataset_path, base, tmp_path, capsys):
+    walks = maze_walks()
+    walks.contract = {**contract().identity, 'position_dims': [1], 'epsilon': 0.4}
+    walks.save(tmp_path / 'robot.npz')
+
+    def train(out, data, *flags):
+        meta_train.main([*meta_arguments(data, base, tmp_path / out, steps=2), *flags])
+        history = load_checkpoint(tmp_path / out / 'checkpoint').metadata['history']
+        return history[-1]['meta']['filter'], weights(tmp_path / out / 'checkpoint')
+
+    found, robot = train('robot', tmp_path / 'robot.npz')
+    assert (found['position_dims'], found['epsilon']) == ([1], 0.4)
+    flags = ('--meta.filter.position-dims', '1', '--meta.filter.epsilon', '0.4')
+    same, maze = train('maze', dataset_path, *flags)
+    assert same == found
+    assert_same_bits(robot, maze)
+    usual, other = train('usual', dataset_path)
+    assert (usual['position_dims'], usual['epsilon']) == ([0, 1], 1.0)
+    assert not all(torch.equal(other[name], tensor) for name, tensor in robot.items())
+    with pytest.raises(SystemExit, match='2'):
+        train('no', tmp_path / 'robot.npz', '--meta.filter.scale', '1', '1')
+    assert (
+        'scale must have one factor per position dimension (1), got 2' in capsys.readouterr().err
+    )
+
+
+def test_policy_of_another_contract_is_refused_by_name(base, tmp_path, capsys):
+    agent, walks = load_checkpoint(base), maze_walks()
+    agent.metadata['contract'] = contract().identity
+    save_checkpoint(agent, tmp_path / 'cart')
+    walks.contract = {'robot': 'van', 'fingerprint': 'other'}
+    data = tmp_path / 'van.npz'
+    walks.save(data)
+    arguments = ['--checkpoints', str(tmp_path / 'cart'), '--dataset', str(data)]
+    for program, given in (
+        (meta_train, meta_arguments(data, tmp_path / 'cart', tmp_path / 'no', steps=1)),
+        (evaluate, ['--offline', *arguments, '--steps-ahead', '5', '--processes', '1']),
+    ):
+        with pytest.raises(SystemExit, match='2'):
+            program.main(given)
+        error = capsys.readouterr().err
+        assert f'the policy {tmp_path}/cart was made for cart (contract ' in error
+        assert f'not for van (contract other), as the dataset {data} is' in error
+    assert not (tmp_path / 'no' / 'checkpoint').exists()
+
+
+def test_run_from_before_contracts_decided_is_continued(dataset_path, base, tmp_path):
+    """Its settings name the radius and the coordinates that were the defaults."""
+    out = tmp_path / 'run'
+    meta_train.main(meta_arguments(dataset_path, base, out, steps=2))
+    record = json.loads((out / 'settings.json').read_text())
+    record['settings']['meta']['filter'] |= {'epsilon': 1.0, 'position_dims': [0, 1]}
+    (out / 'settings.json').write_text(json.dumps(record))
+    meta_train.main([*meta_arguments(dataset_path, base, out, steps=4), '--resume'])
+    meta_train.main(meta_arguments(dataset_path, base, tmp_path / 'whole', steps=4))
+    assert_same_bits(weights(out / 'checkpoint'), weights(tmp_path / 'whole' / 'checkpoint'))
 
 
 @pytest.mark.parametrize(

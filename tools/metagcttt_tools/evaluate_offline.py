@@ -12,10 +12,12 @@ from pathlib import Path
 import sys
 from typing import Any, NamedTuple, TYPE_CHECKING
 
-from metagcttt_core import FilterConfig, TrajectoryDataset, TrajectoryFilter
+from metagcttt_core import TrajectoryDataset, TrajectoryFilter
 from metagcttt_core.adaptation import TTTSettings
 from metagcttt_core.config import Settings
 from metagcttt_core.files import read_json, write_json
+from metagcttt_core.retrieval import FilterSettings
+from metagcttt_core.robot import identity_fault
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
@@ -65,7 +67,7 @@ class OfflineSettings(Settings):
         (0, 10, 20, 50, 100, 200), min_length=1, description='numbers of gradient steps K'
     )
     ttt: TTTSettings = Field(TTTSettings(), description='test-time training')
-    filter: FilterConfig = FilterConfig()
+    filter: FilterSettings = FilterSettings()
     grid: bool = Field(False, description='rank all of `epsilons`, `lrs` and `budgets`')
     epsilons: tuple[float, ...] = Field(
         (0.5, 1.0, 2.0), min_length=1, description="radii of the grid, instead of the filter's"
@@ -190,10 +192,14 @@ def run(
                 f'{path}: takes {agent.obs_dim} observed values and {agent.act_dim} of actions; '
                 f'the dataset has {train.obs_dim} and {train.act_dim}'
             )
+        made_for = agent.metadata.get('contract')
+        if fault := identity_fault(f'the policy {path}', made_for, train.contract):
+            raise ValueError(f'{fault}, as the dataset {settings.dataset} is')
+    radius = settings.filter.on(train.contract).epsilon
     arms = [
         Arm(str(path), epsilon, lr)
         for path in settings.checkpoints
-        for epsilon in (settings.epsilons if settings.grid else (settings.filter.epsilon,))
+        for epsilon in (settings.epsilons if settings.grid else (radius,))
         for lr in (settings.lrs if settings.grid else (settings.ttt.lr,))
     ]
     jobs = [(arm, first) for arm in arms for first in range(0, len(queries), _CHUNK)]

@@ -7,6 +7,7 @@ from typing import Any, TYPE_CHECKING
 
 from metagcttt_core import DatasetError, MetaConfig, TrajectoryDataset
 from metagcttt_core.agents.config import ActorLoss
+from metagcttt_core.robot import identity_fault
 from pydantic import Field
 
 from metagcttt_tools.common.cli import fail, parse
@@ -63,14 +64,13 @@ class MetaTrainSettings(RunSettings):
 def main(argv: list[str] | None = None) -> None:
     """Run the program."""
     settings = parse(MetaTrainSettings, _DESCRIPTION, 'meta-train', argv)
-    from metagcttt_core import CheckpointError
-    from metagcttt_core.meta import DivergedError, TaskError
+    from metagcttt_core.meta import DivergedError
 
     use_threads(settings.threads)
     try:
         with process_group(settings.device):
             _run(settings)
-    except (DatasetError, CheckpointError, TaskError) as error:
+    except ValueError as error:
         fail(str(error))
     except DivergedError as error:
         fail(f'{error}; {left_behind(settings)}')
@@ -85,7 +85,12 @@ def _run(settings: MetaTrainSettings) -> None:
     changes = settings.model_dump(include={'actor_loss'}, exclude_none=True)
     base = load_checkpoint(settings.checkpoint, changes=changes).to(settings.device)
     dataset = TrajectoryDataset.load(settings.dataset)
+    policy, made_for = f'the policy {settings.checkpoint}', base.metadata.get('contract')
+    if fault := identity_fault(policy, made_for, dataset.contract):
+        raise DatasetError(f'{fault}, as the dataset {settings.dataset} is')
     decisive = settings.decisive()
+    in_force = settings.meta.filter.on(dataset.contract).model_dump(mode='json')
+    decisive |= {f'meta.filter.{name}': value for name, value in in_force.items()}
     decisive |= {'dataset': dataset.fingerprint, 'checkpoint': base.fingerprint()}
     base.metadata['history'] = [
         *base.metadata.get('history', []),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
@@ -37,6 +36,7 @@ Ctrl-C saves and ends; --resume, with no other flag than --out, continues."""
 
 
 _USUAL_ENVIRONMENT = 'pointmaze-medium-v0'
+_OF_NO_MAZE = ('import-table', 'import-lerobot')
 
 
 class PretrainSettings(RunSettings):
@@ -48,7 +48,7 @@ class PretrainSettings(RunSettings):
     environment: str | None = Field(
         None,
         description=f'simulator the policy is for; by default {_USUAL_ENVIRONMENT}, and none for '
-        "data of a robot's contract",
+        "data of a robot's contract or of an importer",
     )
     out: Path = Field(Path('out/pretrain'), description='folder of the run')
     agent: AgentName = Field('gcbc', description='kind of agent')
@@ -86,26 +86,34 @@ class PretrainSettings(RunSettings):
 
     @property
     def maze(self) -> str:
-        """The simulator of a policy that is of no robot's contract."""
+        """The simulator of a policy of data that say nothing of another robot."""
         return self.environment or _USUAL_ENVIRONMENT
 
-    def environment_for(self, contract: Mapping[str, Any] | None) -> str | None:
-        """The simulator of the policy; none for data of a robot.
+    def environment_for(self, dataset: TrajectoryDataset) -> str | None:
+        """The simulator of the policy; none for data of a robot, or of unknown origin.
 
         Args:
-            contract: `Contract.identity` of the data, if they have one.
+            dataset: The data.
 
         Raises:
             DatasetError: If a simulator is asked for that the robot does not have.
         """
-        if not contract:
+        program = (dataset.made_from or {}).get('program')
+        if not dataset.contract and program not in _OF_NO_MAZE:
             return self.maze
-        if asked := [n for n in ('environment', 'evaluate_every') if getattr(self, n) is not None]:
+        if dataset.contract:
+            names = ('environment', 'evaluate_every')
+            if asked := [name for name in names if getattr(self, name) is not None]:
+                raise DatasetError(
+                    f'{self.dataset}: of the robot {dataset.contract["robot"]}, which is in no '
+                    f'maze: leave out {" and ".join(asked)}'
+                )
+        elif self.evaluate_every and not self.environment:
             raise DatasetError(
-                f'{self.dataset}: of the robot {contract["robot"]}, which is in no maze: leave '
-                f'out {" and ".join(asked)}'
+                f'{self.dataset}: made by {program}, which does not say of which simulator: '
+                'evaluate_every takes an environment'
             )
-        return None
+        return self.environment
 
     def decisive(self) -> dict[str, Any]:
         """The settings that decide the result, without those of other agents."""
@@ -181,7 +189,7 @@ def _run(settings: PretrainSettings) -> None:
     standardise = {'auto': dataset.contract is not None, 'yes': True, 'no': False}
     agent.scaling = Scaling.of(dataset, standardise=standardise[settings.standardise])
     precision = resolve_precision(settings.precision, agent)
-    environment = settings.environment_for(dataset.contract)
+    environment = settings.environment_for(dataset)
     decisive = settings.decisive() | {
         'environment': environment,
         'dataset': dataset.fingerprint,

@@ -1,6 +1,7 @@
-"""FilterConfig: defaults of the paper and refusals."""
+"""FilterConfig: defaults of the paper and refusals; FilterSettings: those of a contract."""
 
 from metagcttt_core import FilterConfig
+from metagcttt_core.retrieval import FilterSettings
 from pydantic import ValidationError
 import pytest
 
@@ -35,3 +36,32 @@ def test_defaults_are_those_of_the_paper():
 def test_wrong_setting_is_refused_by_name(settings, message):
     with pytest.raises(ValidationError, match=message):
         FilterConfig(**settings)
+
+
+ARM = {'epsilon': 0.3, 'position_dims': [0, 1, 3]}
+
+
+@pytest.mark.parametrize(
+    ('given', 'contract', 'epsilon', 'dims'),
+    [
+        ({}, None, 1.0, (0, 1)),
+        ({}, ARM, 0.3, (0, 1, 3)),
+        ({'epsilon': 1.0}, ARM, 1.0, (0, 1, 3)),
+        ({'position_dims': (0, 1)}, ARM, 0.3, (0, 1)),
+        ({}, {'epsilon': None, 'position_dims': [1, 0]}, 1.0, (1, 0)),
+        ({}, {'epsilon': None, 'position_dims': []}, 1.0, (0, 1)),
+    ],
+)
+def test_what_is_left_out_is_that_of_the_contract(given, contract, epsilon, dims):
+    settings = FilterSettings(**given, slack=3)
+    config = settings.on(contract)
+    assert config == FilterConfig(epsilon=epsilon, position_dims=dims, slack=3)
+    assert FilterSettings(**settings.model_dump(mode='json')).on(contract) == config
+    assert config.on(ARM) == config
+
+
+def test_scale_must_fit_the_coordinates_of_the_contract():
+    settings = FilterSettings(scale=(1.0, 2.0))
+    assert settings.on(None).scale == (1.0, 2.0)
+    with pytest.raises(ValueError, match=r'one factor per position dimension \(3\), got 2'):
+        settings.on(ARM)

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from metagcttt_core import FilterConfig, TrajectoryDataset, TrajectoryFilter
 from metagcttt_core.data import GoalRelabeller
+from metagcttt_core.retrieval import FilterSettings
 from metagcttt_core.training.optimizers import make_optimizer
 from metagcttt_core.training.step import gradient_step
 import numpy as np
@@ -172,6 +173,20 @@ def test_memory_mapped_dataset_gives_the_same_supports(tmp_path):
     found = TrajectoryFilter(mapped, config).query(state, goal)
     assert expected
     assert found == expected
+
+
+def test_contract_of_the_data_decides_about_distances_that_are_left_out():
+    dataset = random_dataset([40, 40], obs_dim=4, seed=2)
+    dataset.contract = {'epsilon': 3.0, 'position_dims': [3, 0, 1]}
+    state, goal = dataset.observations[5], dataset.observations[30]
+    same = FilterConfig(epsilon=3.0, position_dims=(3, 0, 1))
+    other = FilterConfig(epsilon=3.0)
+    expected, different = (TrajectoryFilter(dataset, c).query(state, goal) for c in (same, other))
+    for settings in (None, FilterSettings(), FilterSettings(epsilon=3.0)):
+        finder = TrajectoryFilter(dataset, settings)
+        assert finder.config == same
+        found = finder.query(state, goal)
+        assert found == expected != different
 
 
 @pytest.mark.parametrize('epsilon', [1e-3, 1.0])

@@ -3,7 +3,8 @@
 from pathlib import Path
 
 from metagcttt.deployment import load_deployment
-from metagcttt_core import FilterConfig, save_checkpoint, TrajectoryDataset
+from metagcttt_core import save_checkpoint, TrajectoryDataset
+from metagcttt_core.retrieval import FilterSettings
 import numpy as np
 import pytest
 from tests.core.builders import tiny_agent
@@ -28,7 +29,7 @@ def files(folder: Path, policy: str, data: str) -> tuple[str, str]:
 
 @pytest.mark.parametrize(('policy', 'data'), [(DRIVE, DRIVE), (DRIVE, ''), ('', DRIVE), ('', '')])
 def test_same_or_no_contract_is_used(policy: str, data: str, tmp_path: Path) -> None:
-    deployment = load_deployment(*files(tmp_path, policy, data), FilterConfig())
+    deployment = load_deployment(*files(tmp_path, policy, data), FilterSettings())
     mine, other = contract().identity['fingerprint'], contract(OTHER).identity['fingerprint']
     assert deployment.contract_fault('') == deployment.contract_fault(mine) == ''
     fault = deployment.contract_fault(other)
@@ -41,13 +42,13 @@ def test_same_or_no_contract_is_used(policy: str, data: str, tmp_path: Path) -> 
 
 def test_data_of_another_contract_are_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r'data.npz was made for van .*, not for cart .* high 3'):
-        load_deployment(*files(tmp_path, DRIVE, OTHER), FilterConfig())
+        load_deployment(*files(tmp_path, DRIVE, OTHER), FilterSettings())
 
 
-def test_contract_decides_about_distances(tmp_path: Path) -> None:
-    given = files(tmp_path, FAR, FAR)
-    found = load_deployment(*given, FilterConfig(epsilon=2.0)).trajectory_filter.config
+@pytest.mark.parametrize(('policy', 'data'), [(FAR, FAR), (FAR, ''), ('', FAR), (DRIVE, FAR)])
+def test_contract_decides_about_distances(policy: str, data: str, tmp_path: Path) -> None:
+    given = files(tmp_path, policy, data)
+    found = load_deployment(*given, FilterSettings()).trajectory_filter.config
+    assert (found.position_dims, found.epsilon) == ((3, 0), 0.3)
+    found = load_deployment(*given, FilterSettings(epsilon=2.0)).trajectory_filter.config
     assert (found.position_dims, found.epsilon) == ((3, 0), 2.0)
-    config = FilterConfig(epsilon=1.0)
-    found = load_deployment(*given, config, epsilon_of_contract=True).trajectory_filter.config
-    assert found.epsilon == 0.3

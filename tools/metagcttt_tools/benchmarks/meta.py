@@ -8,7 +8,8 @@ from pathlib import Path
 import time
 from typing import Any, Self, TYPE_CHECKING
 
-from metagcttt_core import FilterConfig, MetaConfig, TrajectoryDataset, TrajectoryFilter
+from metagcttt_core import MetaConfig, TrajectoryDataset, TrajectoryFilter
+from metagcttt_core.retrieval import FilterSettings
 import numpy as np
 from pydantic import Field, model_validator
 from tqdm import tqdm
@@ -45,7 +46,7 @@ class MetaBenchmark(Benchmark):
         inner_steps=50,
         inner_lr=1e-4,
         batch_size=256,
-        filter=FilterConfig(variant='gcttt'),
+        filter=FilterSettings(variant='gcttt'),
     )
     rounds: int = Field(8, ge=1, description='of outer_steps outer steps and as many plain ones')
     threads: int = Field(1, ge=1, description='threads for tensor operations')
@@ -54,7 +55,7 @@ class MetaBenchmark(Benchmark):
 
     @model_validator(mode='after')
     def _measurable(self) -> Self:
-        default = FilterConfig().min_steps
+        default = FilterSettings().min_steps
         if self.meta.actor_only or self.meta.filter.min_steps != default:
             raise ValueError(
                 'meta.actor_only and meta.filter.min_steps have no effect on GCBC, which has no '

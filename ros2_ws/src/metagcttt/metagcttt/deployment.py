@@ -9,7 +9,6 @@ from metagcttt_core import (
     adapt,
     Adaptation,
     Agent,
-    FilterConfig,
     load_checkpoint,
     TrajectoryDataset,
     TrajectoryFilter,
@@ -18,6 +17,7 @@ from metagcttt_core import (
 from metagcttt_core.adaptation import AdaptationCancelled, OnStep
 from metagcttt_core.adaptation.inner_loop import run_inner_loop
 from metagcttt_core.config.assets import checkpoint_path, dataset_path
+from metagcttt_core.retrieval import FilterSettings
 from metagcttt_core.retrieval.value_cache import ValueFunction
 from metagcttt_core.robot import identity_fault
 from metagcttt_core.training.config import EngineName
@@ -108,16 +108,14 @@ class _CancellableValue:
         return self.value_fn(observations, goal)
 
 
-def load_deployment(
-    checkpoint: str, dataset: str, config: FilterConfig, *, epsilon_of_contract: bool = False
-) -> Deployment:
+def load_deployment(checkpoint: str, dataset: str, settings: FilterSettings) -> Deployment:
     """Load a policy, and load and index its dataset.
 
     Args:
         checkpoint: Folder of the checkpoint; empty for the committed one.
         dataset: File of the dataset; empty for the committed one.
-        config: Selection of sub-trajectories; a robot's contract decides about the position.
-        epsilon_of_contract: Whether it also decides about epsilon, if it names one.
+        settings: Selection of sub-trajectories; what they leave out is that of the contract of
+            the data or else of the policy.
 
     Raises:
         FileNotFoundError: If the committed assets are asked for and missing.
@@ -135,12 +133,7 @@ def load_deployment(
     made_for = agent.metadata.get('contract')
     if fault := identity_fault(f'the dataset {dataset_file}', data.contract, made_for):
         raise ValueError(f'{fault}, as the checkpoint {checkpoint_folder} is')
-    contract = made_for or data.contract or {}
-    changes = {'position_dims': contract.get('position_dims')}
-    if epsilon_of_contract:
-        changes['epsilon'] = contract.get('epsilon')
-    given = {name: value for name, value in changes.items() if value}
-    return Deployment(agent, TrajectoryFilter(data, FilterConfig(**config.model_dump() | given)))
+    return Deployment(agent, TrajectoryFilter(data, settings.on(data.contract or made_for)))
 
 
 class Values(Protocol):
@@ -152,17 +145,12 @@ class Values(Protocol):
 
 def deployment_of(parameters: Values) -> Deployment:
     """Load what a node's parameters name; see `load_deployment`."""
-    config = FilterConfig(
+    settings = FilterSettings(
         variant=parameters['filter_variant'],
-        epsilon=parameters['epsilon'] or 1.0,
+        epsilon=parameters['epsilon'] or None,
         top_percent=parameters['top_percent'],
     )
-    return load_deployment(
-        parameters['checkpoint'],
-        parameters['dataset'],
-        config,
-        epsilon_of_contract=not parameters['epsilon'],
-    )
+    return load_deployment(parameters['checkpoint'], parameters['dataset'], settings)
 
 
 def warm_up(deployment: Deployment, config: TTTConfig) -> str:
