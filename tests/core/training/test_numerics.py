@@ -123,3 +123,23 @@ def test_pretraining_in_bfloat16_repeats_to_the_bit_and_keeps_float32_weights(na
     assert all(weight.dtype == torch.float32 for weight in first.parameters())
     plain = pretrain(agent, random_dataset(), config)
     assert not torch.equal(plain.actor.fc0.weight, first.actor.fc0.weight)
+
+
+@pytest.mark.parametrize(
+    ('capabilities', 'told'),
+    [
+        ({}, 1),
+        ({'avx512_bf16': False}, 1),
+        ({'avx512_bf16': True}, 0),
+        ({'architecture': 'arm64'}, 0),
+    ],
+)
+def test_processor_without_bfloat16_is_named_once(monkeypatch, caplog, capabilities, told):
+    given = {'architecture': 'x86_64', **capabilities}
+    monkeypatch.setattr(numerics.torch.cpu, 'get_capabilities', lambda: given)
+    numerics._warn_of_slow_bfloat16.cache_clear()
+    agent = make_agent('gcbc', obs_dim=2, act_dim=2, hidden=(8,))
+    for precision in ('float32', 'auto', 'bfloat16', 'bfloat16'):
+        resolve_precision(precision, agent)
+    numerics._warn_of_slow_bfloat16.cache_clear()
+    assert caplog.text.count('has no instructions for it') == told
