@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from metagcttt_core.evaluation.statistics import normalized_auc, success_statistics
     from metagcttt_core.meta.config import MetaConfig
     from metagcttt_core.meta.post_train import post_train
-    from metagcttt_core.retrieval import FilterConfig, SupportSet, TrajectoryFilter
+    from metagcttt_core.retrieval import FilterConfig, FilterSettings, SupportSet, TrajectoryFilter
     from metagcttt_core.training.checkpoint import (
         CheckpointError,
         load_checkpoint,
@@ -37,7 +37,7 @@ else:
             'evaluation.statistics': ('normalized_auc', 'success_statistics'),
             'meta.config': ('MetaConfig',),
             'meta.post_train': ('post_train',),
-            'retrieval': ('FilterConfig', 'SupportSet', 'TrajectoryFilter'),
+            'retrieval': ('FilterConfig', 'FilterSettings', 'SupportSet', 'TrajectoryFilter'),
             'training.checkpoint': ('CheckpointError', 'load_checkpoint', 'save_checkpoint'),
         },
     )
@@ -48,6 +48,7 @@ __all__ = [
     'CheckpointError',
     'DatasetError',
     'FilterConfig',
+    'FilterSettings',
     'MetaConfig',
     'SupportSet',
     'TTTConfig',
