@@ -54,9 +54,10 @@ class Settings(BaseModel):
     @classmethod
     def _refuse_truth_as_number(cls, value: Any, info: ValidationInfo) -> Any:
         """YAML reads yes and on as true, which pydantic would take for 1."""
-        kinds = set(_kinds(cls.model_fields[info.field_name or ''].annotation))
-        if kinds & {int, float} and bool not in kinds and _holds_truth(value):
-            raise ValueError('must be a number, not true or false')
+        if _holds_truth(value):
+            kinds = set(_kinds(cls.model_fields[info.field_name or ''].annotation))
+            if kinds & {int, float} and bool not in kinds:
+                raise ValueError('must be a number, not true or false')
         return value
 
 
