@@ -59,8 +59,11 @@ class KernelAdam:
                     'exp_avg_sq': torch.zeros_like(parameter),
                 }
         states = [optimizer.state[parameter] for parameter in parameters]
-        self._steps = [state['step'] for state in states]
+        # Raised together.
+        self._steps = torch.stack([state['step'] for state in states])
         self._taken = int(self._steps[0])
+        for number, state in enumerate(states):
+            state['step'] = self._steps[number]
         arrays = [
             parameters,
             [parameter.grad for parameter in parameters],
@@ -79,7 +82,7 @@ class KernelAdam:
     def step(self) -> None:
         """Take a step by the gradients."""
         self._taken += 1
-        torch._foreach_add_(self._steps, 1)
+        self._steps += 1
         beta1, beta2 = self._group['betas']
         self._kernels.adam(
             *self._arguments,

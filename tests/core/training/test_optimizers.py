@@ -1,6 +1,7 @@
 """The optimisers: torch's own results, and what they leave untouched."""
 
-from metagcttt_core.training.optimizers import make_optimizer
+from metagcttt_core.kernels import load_kernels
+from metagcttt_core.training.optimizers import KernelAdam, make_optimizer
 import pytest
 import torch
 from torch import nn
@@ -46,3 +47,32 @@ def test_given_state_is_used_and_not_changed():
     assert torch.equal(results[0], results[1])
     assert all(torch.equal(state[0][key], tensor) for key, tensor in before.items())
     assert torch.equal(results[0], stepped(optimizer, first, GRADIENTS))
+
+
+@pytest.mark.parametrize('taken', [0, 3])
+def test_one_call_for_all_weights_steps_and_counts_as_torch(taken):
+    """The state stays torch's own: saved, given to another optimiser, and stepped further."""
+    kernels = load_kernels()
+    generator = torch.Generator().manual_seed(0)
+    ours, theirs = [
+        [nn.Parameter(torch.linspace(-1, 1, size)) for size in (5, 1, 3)] for _ in range(2)
+    ]
+    optimizers = [make_optimizer('adam', each, 0.1) for each in (ours, theirs)]
+    quick = None
+    for step in range(6):
+        for pair in zip(ours, theirs, strict=True):
+            gradient = torch.randn(pair[0].shape, generator=generator)
+            for parameter in pair:
+                if parameter.grad is None:
+                    parameter.grad = torch.empty_like(parameter)
+                parameter.grad.copy_(gradient)
+        if step == taken:
+            quick = KernelAdam(optimizers[0], kernels)
+        optimizers[1].step()
+        (optimizers[0] if quick is None or step == 5 else quick).step()
+    states = [optimizer.state_dict()['state'] for optimizer in optimizers]
+    assert [float(state['step']) for state in states[0].values()] == [6, 6, 6]
+    for number, state in states[1].items():
+        torch.testing.assert_close(states[0][number], state)
+    for weight, same in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(weight, same)
