@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from metagcttt_core.data import checks, minari, npz
+from metagcttt_core.data import marks, minari, npz, values
 from metagcttt_core.data.errors import DatasetError
 
 _CHUNK_ROWS = 1 << 20
@@ -102,9 +102,9 @@ class TrajectoryDataset:
                 beyond 1e15 (with its row), or a last row that is not terminal.
         """
         where = str(source) if source else 'dataset'
-        observations, origin = checks.centred(observations, 'observations', where)
-        actions = checks.matrix(actions, 'actions', where)
-        terminals = checks.flags(terminals, 'terminals', where)
+        observations, origin = values.centred(observations, 'observations', where)
+        actions = values.matrix(actions, 'actions', where)
+        terminals = values.flags(terminals, 'terminals', where)
         extras = {name: np.asanyarray(array) for name, array in (extras or {}).items()}
         rows = len(observations)
         if rows == 0:
@@ -123,8 +123,8 @@ class TrajectoryDataset:
                 'the last row of every trajectory must be terminal'
             )
         for name, array in extras.items():
-            checks.finite(array, name, where)
-        checks.warn_of_oddities(observations, actions, terminals, where)
+            values.finite(array, name, where)
+        values.warn_of_oddities(observations, actions, terminals, where)
         return cls(
             observations, actions, terminals, extras, source, origin=origin, contract=contract
         )
@@ -133,7 +133,7 @@ class TrajectoryDataset:
     def load(cls, path: str | Path, *, memory_map: bool | None = None) -> Self:
         """Read a dataset in OGBench's npz format, or a Minari dataset.
 
-        Trajectories end where `terminals` or another of `checks.END_MARKS` says so. Suspicious
+        Trajectories end where `terminals` or another of `marks.END_MARKS` says so. Suspicious
         content that can be used is logged: jumps, actions beyond -1 to 1, lost precision.
 
         Args:
@@ -155,26 +155,26 @@ class TrajectoryDataset:
             arrays = npz.read_arrays(
                 path, required=('observations', 'actions', 'terminals'), memory_map=memory_map
             )
-        ends = checks.take_ends(arrays, str(path))
+        ends = marks.take_ends(arrays, str(path))
         observations, actions = arrays.pop('observations'), arrays.pop('actions')
         shape = observations.shape
         following = {
             name: arrays.pop(name)
             for name in list(arrays)
-            if checks.is_following(name)
+            if marks.is_following(name)
             and (name == 'next_observations' or arrays[name].shape == shape)
         }
         contract = made_from = None
         if not minari.is_minari(path):
             contract, made_from = (npz.read_json(path, name) for name in (CONTRACT, MADE_FROM))
-        extras = checks.without_gaps(arrays, str(path))
+        extras = values.without_gaps(arrays, str(path))
         dataset = cls.from_arrays(
             observations, actions, ends, extras, source=path, contract=contract
         )
         dataset.made_from = made_from
         for name, states in following.items():
             states = states - dataset.origin if dataset.origin.any() else states
-            checks.following_rows(dataset.observations, states, ends, name, str(path))
+            marks.following_rows(dataset.observations, states, ends, name, str(path))
         return dataset
 
     def save(self, path: str | Path) -> None:

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 
 from metagcttt_core.data.bounds import check_announced, check_memory
-from metagcttt_core.data.checks import (
+from metagcttt_core.data.errors import DatasetError
+from metagcttt_core.data.marks import (
     END_MARKS,
     is_following,
     looks_like_a_mark,
     looks_like_time,
     may_divide_rows,
 )
-from metagcttt_core.data.errors import DatasetError
 
 SUFFIXES = ('.hdf5', '.h5')
 _PER_ROW_INFOS = ('qpos', 'qvel')

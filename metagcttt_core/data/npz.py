@@ -18,8 +18,8 @@ import zlib
 import numpy as np
 
 from metagcttt_core.data.bounds import check_announced, check_memory
-from metagcttt_core.data.checks import is_following, looks_like_a_mark, may_divide_rows
 from metagcttt_core.data.errors import DatasetError
+from metagcttt_core.data.marks import is_following, looks_like_a_mark, may_divide_rows
 from metagcttt_core.files import atomic_write, claim_folder
 
 MEMORY_MAP_BYTES = 2 << 30

@@ -4,7 +4,7 @@ import logging
 import re
 
 from metagcttt_core import DatasetError, TrajectoryDataset
-from metagcttt_core.data.checks import END_MARKS
+from metagcttt_core.data.marks import END_MARKS
 import numpy as np
 import pytest
 

@@ -140,7 +140,7 @@ def test_first_of_several_non_finite_rows_is_named():
 
 
 def test_non_finite_row_is_found_beyond_the_first_chunk(monkeypatch):
-    monkeypatch.setattr('metagcttt_core.data.checks._CHUNK_ROWS', 2)
+    monkeypatch.setattr('metagcttt_core.data.values._CHUNK_ROWS', 2)
     values = with_value(arrays()['observations'], 5, np.nan)
     with pytest.raises(DatasetError, match='observations is nan in row 5'):
         TrajectoryDataset.from_arrays(**arrays(observations=values))
