@@ -57,12 +57,24 @@ def ray_cluster():
         yield machines
 
 
-def test_a_machine_that_dies_costs_no_bit_of_the_results(ray_cluster, tmp_path, capsys):
-    """Its raylet and the training on it are killed in the middle."""
+@pytest.fixture
+def make_scheduler(ray_cluster):
+    """A process connects to a cluster once."""
     from metagcttt_tools.jobs.cluster import RayScheduler
+    import ray
 
+    def made():
+        ray.shutdown()
+        return RayScheduler(Resources())
+
+    yield made
+    ray.shutdown()
+
+
+def test_a_machine_that_dies_costs_no_bit_of_the_results(make_scheduler, tmp_path, capsys):
+    """Its raylet and the training on it are killed in the middle."""
     maze_walks().save(tmp_path / 'walks.npz')
-    scheduler = RayScheduler(Resources())
+    scheduler = make_scheduler()
     assert (
         'cluster: 3 machines, 2 cores, 0 GPUs; dashboard: not started' in capsys.readouterr().out
     )
@@ -100,3 +112,22 @@ def test_a_machine_that_dies_costs_no_bit_of_the_results(ray_cluster, tmp_path, 
     too_wide = Job(Invocation('evaluate', Path('a'), Path('b'), tmp_path), 1, lambda: 0, cpus=8)
     with pytest.raises(JobError, match='evaluate asks for 8 of CPU on one machine, the largest'):
         scheduler.submit(too_wide)
+
+
+def test_a_stopped_training_saves_and_the_next_call_goes_on(make_scheduler, tmp_path):
+    """Ray blocks SIGINT in its workers and so in what they start."""
+    maze_walks().save(tmp_path / 'walks.npz')
+    job, stop = training(tmp_path, 0), Stop()
+
+    def stop_once_it_trains():
+        while last_step(tmp_path / 'run-0') < EVERY:
+            time.sleep(0.01)
+        stop.set()
+
+    threading.Thread(target=stop_once_it_trains, daemon=True).start()
+    with pytest.raises(KeyboardInterrupt):
+        run_all('pretrain', [job], make_scheduler(), stop)
+    assert last_step(tmp_path / 'run-0') < STEPS
+    run_all('pretrain', [job], make_scheduler(), Stop())
+    assert 'continues after step' in (tmp_path / 'run-0.log').read_text()
+    assert last_step(tmp_path / 'run-0') == STEPS

@@ -38,14 +38,14 @@ def test_a_job_that_is_killed_or_preempted_begins_again(job, end, tmp_path):
 
 def test_a_job_that_fails_ends_all_with_its_last_line(job, tmp_path):
     fails = job('sys.exit("no such dataset")', 'fails')
-    waits = job('signal.signal(2, lambda *_: sys.exit(130)); signal.pause()', 'waits')
+    waits = job('signal.signal(15, lambda *_: sys.exit(75)); signal.pause()', 'waits')
     with pytest.raises(JobError, match='ended with status 1: no such dataset'):
         run_all('jobs', [waits, fails], LocalScheduler(2, retries=5), Stop())
     assert (tmp_path / 'fails.log').read_text().count('# ') == 1
 
 
 def test_stop_makes_jobs_save_and_starts_no_more(job, tmp_path):
-    saves = 'signal.signal(2, lambda *_: (pathlib.Path("saved").touch(), sys.exit(130))); '
+    saves = 'signal.signal(15, lambda *_: (pathlib.Path("saved").touch(), sys.exit(75))); '
     first = job(f'{saves} pathlib.Path("runs").touch(); signal.pause()', 'first')
     second = job('pass', 'second')
     stop = Stop()

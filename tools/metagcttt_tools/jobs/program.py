@@ -106,7 +106,8 @@ def run_program(job: Invocation, stopped: Callable[[], bool] = lambda: False) ->
         except KeyboardInterrupt:
             was_stopped = True
         if was_stopped:
-            process.send_signal(signal.SIGINT)
+            # Ray blocks SIGINT, and shells ignore it in the background; programs inherit both.
+            process.send_signal(signal.SIGTERM)
             process.wait()
             raise JobStoppedError(job.program)
     if process.returncode == 0:
