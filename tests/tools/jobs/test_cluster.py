@@ -131,3 +131,21 @@ def test_a_stopped_training_saves_and_the_next_call_goes_on(make_scheduler, tmp_
     run_all('pretrain', [job], make_scheduler(), Stop())
     assert 'continues after step' in (tmp_path / 'run-0.log').read_text()
     assert last_step(tmp_path / 'run-0') == STEPS
+
+
+@pytest.mark.parametrize(
+    ('address', 'message'),
+    [
+        ('nonsense', "RAY_ADDRESS must be HOST:PORT or auto, got 'nonsense'"),
+        ('localhost:66000', 'RAY_ADDRESS must be HOST:PORT or auto'),
+        ('localhost:1', 'RAY_ADDRESS localhost:1: no cluster answers there: .*refused'),
+        ('[::1]:1', r'RAY_ADDRESS \[::1\]:1: no cluster answers there'),
+        ('ray://localhost:1', 'RAY_ADDRESS ray://localhost:1: no cluster answers there'),
+    ],
+)
+def test_address_without_a_cluster_is_refused_at_once(address, message, monkeypatch):
+    from metagcttt_tools.jobs.cluster import RayScheduler
+
+    monkeypatch.setenv('RAY_ADDRESS', address)
+    with pytest.raises(ValueError, match=message):
+        RayScheduler(Resources())

@@ -3,6 +3,8 @@
 from concurrent.futures import Future
 from functools import partial
 import logging
+import os
+import socket
 from typing import Any
 
 import ray
@@ -10,6 +12,8 @@ from ray.exceptions import RayTaskError, TaskCancelledError
 
 from metagcttt_tools.jobs.program import JobError, JobLostError, JobStoppedError, run_program
 from metagcttt_tools.jobs.scheduler import Job, Resources
+
+_ANSWER_S = 10.0
 
 
 class RayScheduler:
@@ -25,6 +29,7 @@ class RayScheduler:
         Raises:
             ValueError: If there is none.
         """
+        _check_address()
         self._resources = resources
         try:
             context = ray.init('auto', log_to_driver=False, logging_level=logging.WARNING)
@@ -81,6 +86,22 @@ class RayScheduler:
         for task in self._tasks:
             ray.cancel(task)
         self._tasks = []
+
+
+def _check_address() -> None:
+    """Refuse an address where nothing listens, which Ray tries for minutes, deaf to signals."""
+    address = os.environ.get('RAY_ADDRESS', 'auto')
+    if address in ('auto', 'local'):
+        return
+    host, _, port = address.removeprefix('ray://').rpartition(':')
+    if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
+        raise ValueError(f'RAY_ADDRESS must be HOST:PORT or auto, got {address!r}')
+    try:
+        socket.create_connection((host.strip('[]'), int(port)), _ANSWER_S).close()
+    except OSError as error:
+        raise ValueError(
+            f'RAY_ADDRESS {address}: no Ray cluster answers there: {error}'
+        ) from error
 
 
 @ray.remote
