@@ -18,8 +18,8 @@ from metagcttt_core.data.dataset import TrajectoryDataset
 from metagcttt_core.meta.config import MetaConfig
 from metagcttt_core.meta.tasks import MetaTask
 
-# On a CPU stacked tasks are faster than one after another for so many tasks at least, and rows of
-# a batch times weights at most (measured with `tools/benchmark.py meta`).
+# By autograd on a CPU stacked tasks are faster than one after another, for so many tasks at least
+# and rows of a batch times weights at most (`metagcttt benchmark meta --meta.engine eager`).
 _FEWEST_STACKED_ON_CPU = 4
 _LARGEST_STACKED_ON_CPU = 2_000_000
 
@@ -129,6 +129,8 @@ def adapts_together(agent: Agent, config: MetaConfig) -> bool:
         return False
     if agent.device.type != 'cpu':
         return config.meta_batch_size > 1
+    if config.engine != 'eager' and agent.analytic_loss(actor_only=config.actor_only) is not None:
+        return False  # gradients written out are faster one task after another
     weights = agent.trained_parameters(actor_only=config.actor_only)
     work = config.batch_size * sum(weight.numel() for weight in weights)
     return config.meta_batch_size >= _FEWEST_STACKED_ON_CPU and work <= _LARGEST_STACKED_ON_CPU

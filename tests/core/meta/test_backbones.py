@@ -1,5 +1,7 @@
 """Every agent, actor loss and meta-update, full or actor-only, together or one by one."""
 
+from functools import partial
+
 from metagcttt_core import FilterConfig, MetaConfig, post_train
 from metagcttt_core.meta import experts
 from metagcttt_core.meta.experts import adapts_together
@@ -71,9 +73,13 @@ def test_meta_batch_adapted_together_gives_the_policy_of_one_by_one(
 
 def test_tasks_are_stacked_where_that_is_faster():
     small, large = tiny_agent(hidden=(32, 32)), tiny_agent(hidden=(256, 256, 256))
-    assert adapts_together(small, quick(meta_batch_size=4, batch_size=64))
-    assert not adapts_together(small, quick(meta_batch_size=3, batch_size=64))
-    assert not adapts_together(large, quick(meta_batch_size=4, batch_size=256))
+    learned = tiny_agent(hidden=(32, 32), const_std=False)  # has no gradient written out
+    eager = partial(quick, engine='eager')
+    assert adapts_together(small, eager(meta_batch_size=4, batch_size=64))
+    assert not adapts_together(small, eager(meta_batch_size=3, batch_size=64))
+    assert not adapts_together(large, eager(meta_batch_size=4, batch_size=256))
+    assert not adapts_together(small, quick(meta_batch_size=4, batch_size=64, engine='auto'))
+    assert adapts_together(learned, quick(meta_batch_size=4, batch_size=64, engine='auto'))
 
 
 def test_first_task_of_a_meta_batch_is_the_only_one_of_a_batch_of_one():
