@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.results import markdown_table
 from metagcttt_tools.common.session import provenance, sole_writer
-from metagcttt_tools.common.sources import check_fingerprints, fingerprints, identities
+from metagcttt_tools.common.sources import unchanged
 
 if TYPE_CHECKING:
     from metagcttt_tools.graph.robot import RobotOutcome
@@ -129,10 +129,8 @@ def main(argv: list[str] | None = None) -> None:
     try:
         robot_of(settings)  # before anything is written
         with sole_writer(settings.out, settings.out):
-            known = identities(settings.dataset, policies)
-            outcomes = drive_robot(settings, arms, settings.out.parent / 'logs')
-            now = fingerprints(settings.dataset, policies)
-            check_fingerprints(policies[0], known, now)
+            with unchanged(settings.dataset, policies) as known:
+                outcomes = drive_robot(settings, arms, settings.out.parent / 'logs')
             results = _results(settings, outcomes)
             report = {'settings': settings.model_dump(mode='json'), **provenance(), **known}
             write_json(settings.out, {**report, 'results': results})

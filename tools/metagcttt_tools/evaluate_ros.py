@@ -16,7 +16,7 @@ from sim_bridge import make_simulator
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.environment import environment_of
 from metagcttt_tools.common.session import provenance, sole_writer
-from metagcttt_tools.common.sources import check_fingerprints, fingerprints
+from metagcttt_tools.common.sources import unchanged
 from metagcttt_tools.evaluate import (
     EpisodeSettings,
     format_table,
@@ -92,15 +92,10 @@ def main(argv: list[str] | None = None) -> None:
 
     try:
         with sole_writer(settings.out, settings.out):
-            before = fingerprints(settings.dataset, settings.checkpoints)
-            results = evaluate_ros(settings)
-            check_fingerprints(
-                settings.checkpoints[0],
-                {'fingerprints': before},
-                fingerprints(settings.dataset, settings.checkpoints),
-            )
-            report = {'settings': settings.model_dump(mode='json'), **provenance()}
-            write_json(settings.out, {**report, 'fingerprints': before, 'results': results})
+            with unchanged(settings.dataset, settings.checkpoints) as known:
+                results = evaluate_ros(settings)
+            report = {'settings': settings.model_dump(mode='json'), **provenance(), **known}
+            write_json(settings.out, {**report, 'results': results})
     except (NodeFailedError, NoAnswerError, ValueError) as error:
         fail(str(error))
     except KeyboardInterrupt:

@@ -1,6 +1,7 @@
 """What a dataset was made from: a record that travels with it into policies and results."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 import hashlib
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,18 @@ def identities(
     data = TrajectoryDataset.load(dataset)
     made_from = {'made_from': data.made_from} if data.made_from else {}
     return {'fingerprints': {'dataset': data.fingerprint, 'policies': policies}, **made_from}
+
+
+@contextmanager
+def unchanged(dataset: Path, checkpoints: Sequence[Path]) -> Iterator[dict[str, Any]]:
+    """The `identities` of data and policies that nodes read while this lasts.
+
+    Raises:
+        ValueError: If they are others at the end.
+    """
+    known = identities(dataset, checkpoints)
+    yield known
+    check_fingerprints(checkpoints[0], known, fingerprints(dataset, checkpoints))
 
 
 def fingerprints(
