@@ -12,7 +12,6 @@ import numpy as np
 from metagcttt_core.data import marks, minari, npz, values
 from metagcttt_core.data.errors import DatasetError
 
-_CHUNK_ROWS = 1 << 20
 CONTRACT = 'contract'
 """Name of the text in an npz file that holds the contract as JSON."""
 MADE_FROM = 'made_from'
@@ -205,9 +204,8 @@ class TrajectoryDataset:
     @cached_property
     def action_reach(self) -> np.ndarray:
         """The largest absolute value of each dimension of an action, (act_dim,) float64."""
-        starts = range(0, self.num_rows, _CHUNK_ROWS)
-        parts = [np.abs(self.actions[start : start + _CHUNK_ROWS]).max(axis=0) for start in starts]
-        return np.max(parts, axis=0).astype(np.float64)
+        largest = [np.abs(part).max(axis=0) for _, part in values.chunks(self.actions)]
+        return np.max(largest, axis=0).astype(np.float64)
 
     @property
     def num_rows(self) -> int:
@@ -240,8 +238,8 @@ class TrajectoryDataset:
         digest = hashlib.blake2b(digest_size=8)
         for array in (self.observations, self.actions, self.terminals):
             digest.update(f'{array.dtype.str}{array.shape}'.encode())
-            for start in range(0, len(array), _CHUNK_ROWS):
-                digest.update(np.ascontiguousarray(array[start : start + _CHUNK_ROWS]).data)
+            for _, part in values.chunks(array):
+                digest.update(np.ascontiguousarray(part).data)
         if self.origin.any():
             digest.update(self.origin.data)
         if self.contract:

@@ -29,11 +29,10 @@ def matrix(values: np.ndarray, name: str, where: str) -> np.ndarray:
         raise DatasetError(
             f'{where}: {name} must have shape (rows, dimensions), got {array.shape}'
         )
-    if array.dtype == np.float32:
-        usable(array, name, where)
-        return array
-    # Checked before narrowing too: a finite double can become infinite in float32.
+    # Before narrowing: a finite double can become infinite in float32.
     usable(array, name, where)
+    if array.dtype == np.float32:
+        return array
     narrowed = array.astype(np.float32)
     _warn_of_lost_precision(array, narrowed, name, where)
     return narrowed
@@ -55,12 +54,15 @@ def centred(values: np.ndarray, name: str, where: str) -> tuple[np.ndarray, np.n
         return plain, np.zeros(plain.shape[1])
     usable(array, name, where)
     origin = np.zeros(array.shape[1])
-    dims = [dim for dim, _, _ in _lost_precision(array, array.astype(np.float32))]
-    for dim in dims:
+    narrowed = array.astype(np.float32)
+    lost = _lost_precision(array, narrowed)
+    if not lost:
+        return narrowed, origin
+    for dim, _, _ in lost:
         column = array[:, dim]
         origin[dim] = np.rint(column.min() / 2 + column.max() / 2)
         _log.info('%s: %s[:, %d] is counted from %.0f', where, name, dim, origin[dim])
-    return matrix(array - origin if dims else array, name, where), origin
+    return matrix(array - origin, name, where), origin
 
 
 def flags(values: np.ndarray, name: str, where: str) -> np.ndarray:

@@ -5,9 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from metagcttt_core import Agent, make_agent, TrajectoryDataset
+from metagcttt_core.agents import AGENTS
 import numpy as np
+import pytest
 import torch
 
+EVERY_AGENT = pytest.mark.parametrize('name', sorted(AGENTS))
 DATA = Path(__file__).parents[1] / 'data'
 
 

@@ -12,19 +12,19 @@ from metagcttt_core import (
     TTTConfig,
 )
 from metagcttt_core.adaptation import AdaptationCancelled
-from metagcttt_core.agents import AGENTS, GCBC
+from metagcttt_core.agents import GCBC
 import numpy as np
 import pytest
 from tests.core.builders import (
     assert_bit_equal,
     assert_changed,
+    EVERY_AGENT,
     random_dataset,
     tiny_agent,
     weights_of,
 )
 import torch
 
-EVERY_AGENT = pytest.mark.parametrize('name', sorted(AGENTS))
 GOAL = np.array([0.5, -1.5])
 
 

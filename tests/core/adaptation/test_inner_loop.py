@@ -4,13 +4,11 @@ import math
 
 from metagcttt_core.adaptation import AdaptationCancelled
 from metagcttt_core.adaptation.inner_loop import run_inner_loop
-from metagcttt_core.agents import AGENTS, GCBC
+from metagcttt_core.agents import GCBC
 import numpy as np
 import pytest
-from tests.core.builders import assert_bit_equal, tiny_agent, weights_of
+from tests.core.builders import assert_bit_equal, EVERY_AGENT, tiny_agent, weights_of
 import torch
-
-EVERY_AGENT = pytest.mark.parametrize('name', sorted(AGENTS))
 
 
 def batches_for(agent, count: int, size: int = 16, seed: int = 0):

@@ -3,14 +3,17 @@
 import math
 
 from metagcttt_core import make_agent
-from metagcttt_core.agents import AGENTS
 import numpy as np
 from pydantic import ValidationError
 import pytest
-from tests.core.builders import assert_bit_equal, assert_changed, tiny_agent, weights_of
+from tests.core.builders import (
+    assert_bit_equal,
+    assert_changed,
+    EVERY_AGENT,
+    tiny_agent,
+    weights_of,
+)
 import torch
-
-EVERY_AGENT = pytest.mark.parametrize('name', sorted(AGENTS))
 
 
 def mean_of(agent, observation, goal) -> np.ndarray:

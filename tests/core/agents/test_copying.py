@@ -2,15 +2,12 @@
 
 import copy
 
-from metagcttt_core.agents import AGENTS
 from metagcttt_core.agents.copying import copied
 import pytest
-from tests.core.builders import tiny_agent
+from tests.core.builders import EVERY_AGENT, tiny_agent
 import torch
 from torch import nn
 from torch.nn.utils.parametrizations import orthogonal
-
-EVERY_AGENT = pytest.mark.parametrize('name', sorted(AGENTS))
 
 
 class Odd(nn.Module):

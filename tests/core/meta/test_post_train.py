@@ -9,7 +9,6 @@ from metagcttt_core import (
     TrajectoryDataset,
 )
 from metagcttt_core.adaptation.batches import QueryBatches
-from metagcttt_core.agents import AGENTS
 from metagcttt_core.meta import tasks
 from metagcttt_core.meta.registry import GRADIENT_UPDATES, META_UPDATES
 from metagcttt_core.meta.tasks import TaskSampler
@@ -23,6 +22,7 @@ import pytest
 from tests.core.builders import (
     assert_bit_equal,
     assert_changed,
+    EVERY_AGENT,
     random_dataset,
     terminals_of,
     tiny_agent,
@@ -31,7 +31,6 @@ from tests.core.builders import (
 import torch
 
 EVERY_ALGORITHM = pytest.mark.parametrize('algorithm', sorted(META_UPDATES))
-EVERY_AGENT = pytest.mark.parametrize('name', sorted(AGENTS))
 WIDE = FilterConfig(epsilon=4.0, top_percent=100)
 
 

@@ -9,15 +9,13 @@ import threading
 from typing import Any
 
 from metagcttt_core import CheckpointError, files, load_checkpoint, save_checkpoint
-from metagcttt_core.agents import AGENTS
 from metagcttt_core.training.checkpoint import has_checkpoint, load_training_state, TrainingState
 from metagcttt_core.training.optimizers import pretrained_state
 import pytest
 import safetensors.torch
-from tests.core.builders import assert_bit_equal, tiny_agent, weights_of
+from tests.core.builders import assert_bit_equal, EVERY_AGENT, tiny_agent, weights_of
 import torch
 
-EVERY_AGENT = pytest.mark.parametrize('name', sorted(AGENTS))
 METADATA = {'environment': 'pointmaze-medium-v0', 'history': [{'stage': 'pretrain', 'seed': 3}]}
 
 

@@ -3,7 +3,6 @@
 from functools import partial
 
 from metagcttt_core import CheckpointError, load_checkpoint, save_checkpoint, TrajectoryDataset
-from metagcttt_core.agents import AGENTS
 from metagcttt_core.data import GoalRelabeller
 from metagcttt_core.training import pretrain as pretrain_module
 from metagcttt_core.training.engine import make_engine
@@ -16,6 +15,7 @@ import pytest
 from tests.core.builders import (
     assert_bit_equal,
     assert_changed,
+    EVERY_AGENT,
     random_dataset,
     terminals_of,
     tiny_agent,
@@ -23,7 +23,6 @@ from tests.core.builders import (
 )
 import torch
 
-EVERY_AGENT = pytest.mark.parametrize('name', sorted(AGENTS))
 CONFIG = PretrainConfig(steps=5, lr=0.01, batch_size=8)
 
 
