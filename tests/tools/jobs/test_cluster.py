@@ -138,9 +138,9 @@ def test_a_stopped_training_saves_and_the_next_call_goes_on(make_scheduler, tmp_
     [
         ('nonsense', "RAY_ADDRESS must be HOST:PORT or auto, got 'nonsense'"),
         ('localhost:66000', 'RAY_ADDRESS must be HOST:PORT or auto'),
-        ('localhost:1', 'RAY_ADDRESS localhost:1: no cluster answers there: .*refused'),
-        ('[::1]:1', r'RAY_ADDRESS \[::1\]:1: no cluster answers there'),
-        ('ray://localhost:1', 'RAY_ADDRESS ray://localhost:1: no cluster answers there'),
+        ('localhost:1', 'RAY_ADDRESS localhost:1: no Ray cluster answers there: .*refused'),
+        ('[::1]:1', r'RAY_ADDRESS \[::1\]:1: no Ray cluster answers there'),
+        ('ray://localhost:1', 'RAY_ADDRESS ray://localhost:1: no Ray cluster answers there'),
     ],
 )
 def test_address_without_a_cluster_is_refused_at_once(address, message, monkeypatch):

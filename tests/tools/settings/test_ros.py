@@ -50,8 +50,7 @@ def watch_robot(patch: pytest.MonkeyPatch, seen: Seen) -> None:
         return {arm: [outcome] * len(drives) for arm in arms}
 
     patch.setattr(drive, 'drive_policies', note)
-    patch.setattr(evaluate_robot, 'identities', lambda *_: {'fingerprints': {}})
-    patch.setattr(evaluate_robot, 'fingerprints', lambda *_: {})
+    patch.setattr(evaluate_robot, 'unchanged', lambda *_: nullcontext({'fingerprints': {}}))
     patch.setattr(demo_report, 'draw', lambda *_: None)
 
 
