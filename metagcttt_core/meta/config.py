@@ -49,6 +49,12 @@ class MetaConfig(InnerLoopConfig):
         '(test-gradient), or nothing (reject)',
     )
     meta_batch_size: int = Field(1, ge=1, description='tasks per outer step B')
+    task_candidates: int = Field(
+        1,
+        ge=1,
+        description='state-goal pairs drawn per task, of which the one with the longest '
+        'trajectories is taken; 1 is uniform, as in the paper',
+    )
     filter: FilterSettings = FilterSettings()
 
     @model_validator(mode='after')

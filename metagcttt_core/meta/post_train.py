@@ -63,7 +63,9 @@ def post_train(
     run = run or TrainingRun('post_train', {})
     with record_function(INDEX):
         trajectory_filter = TrajectoryFilter(dataset, config.filter)
-    sampler = TaskSampler(trajectory_filter, config.test_fraction, config.max_test)
+    sampler = TaskSampler(
+        trajectory_filter, config.test_fraction, config.max_test, config.task_candidates
+    )
     meta_update = META_UPDATES[config.algorithm]
     outer_optimizer = None
     if config.algorithm in GRADIENT_UPDATES or config.algorithm in META_UPDATES.plugins:

@@ -89,7 +89,9 @@ def test_each_record_covers_the_steps_since_the_last():
 
 def test_report_takes_its_numbers_from_task_and_result():
     train = SupportSet(np.arange(8), [], np.zeros(0), np.zeros(0), 1, 1, milliseconds=2.5)
-    task = MetaTask(np.array([1.0, -2.0]), train, train, num_transitions=10, redraws=3)
+    task = MetaTask(
+        np.array([1.0, -2.0]), train, train, num_transitions=10, mean_steps=5.0, redraws=3
+    )
     result = Adaptation(tiny_agent(), [5.0, 4.0], [3.0, 2.0, 1.0], best_step=2)
     assert TaskReport.of(task, result, 6.0, 1.5) == TaskReport(
         (1.0, -2.0), 10, 3, 2.5, [5.0, 4.0], [3.0, 2.0, 1.0], 2, 6.0, 1.5

@@ -14,11 +14,14 @@ class FakeFilter:
     def __init__(self, dataset, indices) -> None:
         self.dataset = dataset
         self.indices = indices
+        self.segments = [(indices[0], indices[-1] + 1)]
         self.queries = []
 
     def query(self, state, goal, value_fn=None) -> SupportSet:
         self.queries.append((state, goal, value_fn))
-        return SupportSet(np.array(self.indices), [], np.zeros(0), np.zeros(0), 1, 1)
+        kept = len(self.segments)
+        episodes, scores = np.zeros(kept, int), np.zeros(kept)
+        return SupportSet(np.array(self.indices), self.segments, episodes, scores, kept, kept)
 
 
 def line(length: int, offset: float = 0.0):
@@ -104,3 +107,29 @@ def test_same_generator_gives_the_same_task():
     first, again = (sampler.sample(np.random.default_rng(4)) for _ in range(2))
     assert np.array_equal(first.goal, again.goal)
     assert (first.train, first.test) == (again.train, again.test)
+
+
+def test_longest_of_the_candidates_is_taken():
+    """Each of three candidates is drawn as one alone would be, from the same generator."""
+    dataset = random_dataset([60, 60])
+    finder = TrajectoryFilter(dataset, FilterConfig(epsilon=3.0))
+    alone = TaskSampler(finder, 0.2, 128)
+    longer = TaskSampler(finder, 0.2, 128, candidates=3)
+    rng, again = np.random.default_rng(5), np.random.default_rng(5)
+    taken = []
+    for _ in range(20):
+        drawn = [alone.sample(rng) for _ in range(3)]
+        task = longer.sample(again)
+        best = int(np.argmax([each.mean_steps for each in drawn]))
+        assert task.mean_steps == drawn[best].mean_steps
+        assert (task.train, task.test) == (drawn[best].train, drawn[best].test)
+        taken.append(best)
+    assert set(taken) == {0, 1, 2}
+
+
+def test_mean_length_of_a_task_is_that_of_its_trajectories():
+    """Six transitions in two trajectories; the row without a successor does not count."""
+    fake = FakeFilter(dataset_at([line(5), line(5)]), [0, 1, 2, 3, 4, 7, 8])
+    fake.segments = [(0, 5), (7, 9)]
+    task = TaskSampler(fake, 0.5, 128).sample(np.random.default_rng(0))
+    assert (task.num_transitions, task.mean_steps) == (6, 3.0)

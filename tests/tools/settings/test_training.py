@@ -179,6 +179,7 @@ META = Walk(
         'meta.meta_lr': Proof(0.5, {'meta.algorithm': 'reptile'}),
         'meta.rejected': Proof('reject', {'meta.algorithm': 'fomaml', 'meta.inner_lr': 3.0}),
         'meta.meta_batch_size': 2,
+        'meta.task_candidates': 4,
         **under('meta', INNER_LOOP | {'early_stopping': False}, actor_only=CRITIC),
         **under('meta.filter', FILTER, min_steps=CRITIC),
         'cuda_graphs': False,
