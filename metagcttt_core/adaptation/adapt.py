@@ -129,13 +129,7 @@ def _held_out(agent: Agent, batch: TensorBatch, measure: GuardName, *, actor_onl
 
 
 def _check(agent: Agent, dataset: TrajectoryDataset, goal: np.ndarray) -> None:
-    for name in ('obs_dim', 'act_dim'):
-        if getattr(agent, name) != getattr(dataset, name):
-            raise ValueError(
-                f'{name} is {getattr(agent, name)} for the agent '
-                f'and {getattr(dataset, name)} for the dataset; they must match'
-            )
-    agent.scaling.check(dataset)
+    agent.check(dataset)
     if np.shape(goal) != (agent.obs_dim,):
         raise ValueError(f'goal must have shape ({agent.obs_dim},), got {np.shape(goal)}')
     if not np.isfinite(goal).all():

@@ -14,6 +14,8 @@ from metagcttt_core.agents.config import AgentSettings
 from metagcttt_core.agents.copying import copied
 from metagcttt_core.agents.networks import MLP
 from metagcttt_core.data.dataset import TrajectoryDataset
+from metagcttt_core.data.errors import DatasetError
+from metagcttt_core.data.identity import identity_fault
 from metagcttt_core.data.relabel import GoalRelabeller
 from metagcttt_core.data.scaling import Scaling
 
@@ -84,6 +86,24 @@ class Agent(nn.Module, ABC):
         if not self.settings.const_std:
             policy.register_parameter('log_stds', nn.Parameter(torch.zeros(self.act_dim)))
         return policy
+
+    def check(self, dataset: TrajectoryDataset) -> None:
+        """Refuse data that this policy can be neither trained nor adapted on.
+
+        Raises:
+            DatasetError: If they are of other widths or of another robot's contract, or outside
+                the scaling.
+        """
+        where = f'the dataset {dataset.source}' if dataset.source else 'the dataset'
+        own, others = (self.obs_dim, self.act_dim), (dataset.obs_dim, dataset.act_dim)
+        if own != others:
+            raise DatasetError(
+                f'{self.origin} is for observations of {own[0]} and actions of {own[1]} values, '
+                f'{where} has {others[0]} and {others[1]}'
+            )
+        if fault := identity_fault(where, dataset.contract, self.metadata.get('contract')):
+            raise DatasetError(f'{fault}, as {self.origin} is')
+        self.scaling.check(dataset)
 
     @abstractmethod
     def losses(

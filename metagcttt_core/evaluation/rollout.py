@@ -78,6 +78,8 @@ def run_episode(
     ttt = ttt or TTTConfig(steps=0)
     if ttt.steps > 0 and trajectory_filter is None:
         raise ValueError('test-time training needs a dataset or a trajectory filter')
+    if trajectory_filter is not None:
+        agent.check(trajectory_filter.dataset)
     observation, goal = simulator.reset(task_id=task_id, seed=seed)
     observations: list[np.ndarray] = [observation]
     actions: list[np.ndarray] = []

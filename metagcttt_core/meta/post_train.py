@@ -55,10 +55,10 @@ def post_train(
     Raises:
         DivergedError: When a loss or a weight is no longer finite. `run` keeps the checkpoint
             before that.
-        DatasetError: If the data are outside the agent's scaling.
+        DatasetError: If the data are none for the agent; see `Agent.check`.
         TaskError: If no task can be found, or there are more processes than tasks.
     """
-    agent.scaling.check(dataset)
+    agent.check(dataset)
     base = agent.clone()
     run = run or TrainingRun('post_train', {})
     with record_function(INDEX):

@@ -45,9 +45,9 @@ def pretrain(
         The trained copy, with the optimiser's state.
 
     Raises:
-        DatasetError: If the data are outside the agent's scaling.
+        DatasetError: If the data are none for the agent; see `Agent.check`.
     """
-    agent.scaling.check(dataset)
+    agent.check(dataset)
     agent = agent.clone()
     run = run or TrainingRun('pretrain', {})
     relabeller = agent.relabeller(dataset)

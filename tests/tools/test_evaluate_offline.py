@@ -98,7 +98,10 @@ def test_what_does_not_fit_is_refused(folder, tmp_path, capsys):
     for more, error in (
         (('--held-out', other), 'other.npz: observations or actions differ in width'),
         (('--held-out', 'none.npz'), 'none.npz: no such file'),
-        (('--dataset', other), 'fresh: takes 2 observed values and 2 of actions; the dataset has'),
+        (
+            ('--dataset', other),
+            f'is for observations of 2 and actions of 2 values, the dataset {other} has 3',
+        ),
         (('--against', str(tmp_path / 'none.json')), 'none.json: no results of metagcttt evaluat'),
         (('--steps-ahead', '500'), 'the longest held-out trajectory has 100 transitions'),
         (('--budgets', '5', '0'), 'must ascend from 0 or more'),

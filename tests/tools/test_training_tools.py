@@ -13,9 +13,10 @@ import metagcttt_core
 from metagcttt_core import adapt, load_checkpoint, save_checkpoint, TrajectoryDataset
 from metagcttt_tools import evaluate, meta_train, pack_assets, pretrain
 from metagcttt_tools.common.cli import parse
+from metagcttt_tools.main import main as metagcttt
 import numpy as np
 import pytest
-from tests.core.builders import maze_walks
+from tests.core.builders import maze_walks, random_dataset
 from tests.core.robot.messages import contract
 from tests.programs import start
 from tests.tools.tables import squeezed
@@ -189,9 +190,23 @@ def test_policy_of_another_contract_is_refused_by_name(base, tmp_path, capsys):
         with pytest.raises(SystemExit, match='2'):
             program.main(given)
         error = capsys.readouterr().err
-        assert f'the policy {tmp_path}/cart was made for cart (contract ' in error
-        assert f'not for van (contract other), as the dataset {data} is' in error
+        assert f'the dataset {data} was made for van (contract other), not for cart (' in error
+        assert f', as {tmp_path}/cart is' in error
     assert not (tmp_path / 'no' / 'checkpoint').exists()
+
+
+@pytest.mark.parametrize('program', ['meta-train', 'evaluate', 'loss-curves', 'draw-episodes'])
+def test_data_of_other_widths_are_refused_by_name(program, base, tmp_path, capsys):
+    data, out = tmp_path / 'wide.npz', tmp_path / 'out.json'
+    random_dataset([20], obs_dim=3).save(data)
+    policies = '--checkpoints' if program == 'evaluate' else '--checkpoint'
+    with pytest.raises(SystemExit, match='2'):
+        metagcttt([program, policies, str(base), '--dataset', str(data), '--out', str(out)])
+    assert (
+        f'error: {base} is for observations of 2 and actions of 2 values, the dataset {data} has '
+        '3 and 2' in capsys.readouterr().err
+    )
+    assert not (out / 'checkpoint').exists()
 
 
 def test_run_from_before_contracts_decided_is_continued(dataset_path, base, tmp_path):

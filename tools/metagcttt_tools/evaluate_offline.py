@@ -17,7 +17,6 @@ from metagcttt_core.adaptation import TTTSettings
 from metagcttt_core.config import Settings
 from metagcttt_core.files import read_json, write_json
 from metagcttt_core.retrieval import FilterSettings
-from metagcttt_core.robot import identity_fault
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
@@ -186,15 +185,7 @@ def run(
     from metagcttt_core import load_checkpoint
 
     for path in settings.checkpoints:
-        agent = load_checkpoint(path)
-        if (agent.obs_dim, agent.act_dim) != (train.obs_dim, train.act_dim):
-            raise ValueError(
-                f'{path}: takes {agent.obs_dim} observed values and {agent.act_dim} of actions; '
-                f'the dataset has {train.obs_dim} and {train.act_dim}'
-            )
-        made_for = agent.metadata.get('contract')
-        if fault := identity_fault(f'the policy {path}', made_for, train.contract):
-            raise ValueError(f'{fault}, as the dataset {settings.dataset} is')
+        load_checkpoint(path).check(train)
     radius = settings.filter.on(train.contract).epsilon
     arms = [
         Arm(str(path), epsilon, lr)

@@ -97,14 +97,16 @@ def test_time_curves(settings: LossCurvesSettings) -> Curves:
 
     changes = settings.model_dump(include={'actor_loss'}, exclude_none=True)
     agent = load_checkpoint(settings.checkpoint, changes=changes)
-    trajectory_filter = TrajectoryFilter(TrajectoryDataset.load(settings.dataset), settings.filter)
+    dataset = TrajectoryDataset.load(settings.dataset)
+    agent.check(dataset)
+    trajectory_filter = TrajectoryFilter(dataset, settings.filter)
     with make_simulator(environment_of(agent)) as simulator:
         observation, goal = simulator.reset(task_id=settings.task, seed=settings.seed)
     support = trajectory_filter.query(observation, goal, agent.value_fn)
     return {
         f'lr {lr:g}': adaptation_losses(
             agent,
-            trajectory_filter.dataset,
+            dataset,
             support,
             goal,
             TTTConfig(**settings.ttt.model_dump(), lr=lr),

@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from metagcttt_core import DatasetError, MetaConfig, TrajectoryDataset
+from metagcttt_core import MetaConfig, TrajectoryDataset
 from metagcttt_core.agents.config import ActorLoss
-from metagcttt_core.robot import identity_fault
 from pydantic import Field
 
 from metagcttt_tools.common.cli import fail, parse
@@ -85,9 +84,7 @@ def _run(settings: MetaTrainSettings) -> None:
     changes = settings.model_dump(include={'actor_loss'}, exclude_none=True)
     base = load_checkpoint(settings.checkpoint, changes=changes).to(settings.device)
     dataset = TrajectoryDataset.load(settings.dataset)
-    policy, made_for = f'the policy {settings.checkpoint}', base.metadata.get('contract')
-    if fault := identity_fault(policy, made_for, dataset.contract):
-        raise DatasetError(f'{fault}, as the dataset {settings.dataset} is')
+    base.check(dataset)
     decisive = settings.decisive()
     in_force = settings.meta.filter.on(dataset.contract).model_dump(mode='json')
     decisive |= {f'meta.filter.{name}': value for name, value in in_force.items()}

@@ -451,8 +451,18 @@ def test_support_of_a_real_query_makes_an_expert(dataset):
 @pytest.mark.parametrize(
     ('agent_settings', 'goal', 'ttt', 'message'),
     [
-        ({'obs_dim': 3}, np.zeros(3), {}, 'obs_dim is 3 for the agent and 2 for the dataset'),
-        ({'act_dim': 1}, GOAL, {}, 'act_dim is 1 for the agent and 2 for the dataset'),
+        (
+            {'obs_dim': 3},
+            np.zeros(3),
+            {},
+            'is for observations of 3 and actions of 2 values, the dataset has 2 and 2',
+        ),
+        (
+            {'act_dim': 1},
+            GOAL,
+            {},
+            'is for observations of 2 and actions of 1 values, the dataset has 2 and 2',
+        ),
         ({}, np.zeros(3), {}, r'goal must have shape \(2,\), got \(3,\)'),
         ({}, np.zeros((1, 2)), {}, r'goal must have shape \(2,\), got \(1, 2\)'),
         ({}, np.array([0, np.inf]), {}, 'goal holds a non-finite value'),

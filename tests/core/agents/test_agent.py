@@ -2,7 +2,7 @@
 
 import math
 
-from metagcttt_core import make_agent
+from metagcttt_core import DatasetError, make_agent, TrajectoryDataset
 import numpy as np
 from pydantic import ValidationError
 import pytest
@@ -10,6 +10,7 @@ from tests.core.builders import (
     assert_bit_equal,
     assert_changed,
     EVERY_AGENT,
+    random_dataset,
     tiny_agent,
     weights_of,
 )
@@ -267,3 +268,33 @@ def test_fingerprint_tells_policies_apart_that_act_or_adapt_differently():
     assert len(set(different)) == len(different)
     assert fingerprint() == fingerprint()
     assert tiny_agent('gciql').clone().fingerprint() == fingerprint()
+
+
+@pytest.mark.parametrize(
+    ('change', 'fault'),
+    [
+        (
+            {'obs_dim': 3},
+            'the agent is for observations of 2 and actions of 2 values, the dataset has 3 and 2',
+        ),
+        ({'act_dim': 1}, 'values, the dataset has 2 and 1'),
+        (
+            {'contract': {'robot': 'van', 'fingerprint': 'a'}},
+            r'the dataset was made for van \(contract a\), not for cart \(contract b\), as',
+        ),
+        ({'scale': 3}, r'dataset: actions\[:, 0\] reach .*, beyond the limit of the policy, 1'),
+    ],
+)
+def test_data_for_another_policy_are_refused(change, fault):
+    agent = tiny_agent()
+    agent.metadata['contract'] = {'robot': 'cart', 'fingerprint': 'b'}
+    agent.check(random_dataset([9]))
+    widths = {name: width for name, width in change.items() if name.endswith('dim')}
+    data = random_dataset([9], **widths)
+    data.contract = change.get('contract')
+    if scale := change.get('scale'):
+        data = TrajectoryDataset.from_arrays(
+            data.observations, scale * data.actions, data.terminals
+        )
+    with pytest.raises(DatasetError, match=fault):
+        agent.check(data)

@@ -37,9 +37,19 @@ def identities(
     Returns:
         `fingerprints`, see there, and, where the dataset says so, what it was `made_from`; that is
         no part of the former, since equal data are equal wherever they come from.
+
+    Raises:
+        ValueError: If one cannot be read, or the data are none for a policy; see `Agent.check`.
     """
-    policies = _hashes(checkpoints, actor_loss)  # first, as they are read sooner than data
+    from metagcttt_core import load_checkpoint
+
+    changes = {'actor_loss': actor_loss} if actor_loss else {}
+    # First, as they are read sooner than data.
+    agents = [load_checkpoint(path, changes=changes) for path in checkpoints]
     data = TrajectoryDataset.load(dataset)
+    for agent in agents:
+        agent.check(data)
+    policies = [agent.fingerprint() for agent in agents]
     made_from = {'made_from': data.made_from} if data.made_from else {}
     return {'fingerprints': {'dataset': data.fingerprint, 'policies': policies}, **made_from}
 
@@ -62,13 +72,6 @@ def fingerprints(
     """Hashes of a dataset and of policies, as they are adapted; see `identities`."""
     found: dict[str, Any] = identities(dataset, checkpoints, actor_loss)['fingerprints']
     return found
-
-
-def _hashes(checkpoints: Sequence[Path], actor_loss: ActorLoss | None) -> list[str]:
-    from metagcttt_core import load_checkpoint
-
-    changes = {'actor_loss': actor_loss} if actor_loss else {}
-    return [load_checkpoint(path, changes=changes).fingerprint() for path in checkpoints]
 
 
 def check_fingerprints(file: Path, report: Mapping[str, Any], now: Mapping[str, Any]) -> None:

@@ -124,16 +124,9 @@ def load_deployment(checkpoint: str, dataset: str, settings: FilterSettings) -> 
     checkpoint_folder, dataset_file = checkpoint_path(checkpoint), dataset_path(dataset)
     agent = load_checkpoint(checkpoint_folder)
     data = TrajectoryDataset.load(dataset_file)
-    if (agent.obs_dim, agent.act_dim) != (data.obs_dim, data.act_dim):
-        raise ValueError(
-            f'the checkpoint {checkpoint_folder} is for observations of {agent.obs_dim} and '
-            f'actions of {agent.act_dim} values, the dataset {dataset_file} has {data.obs_dim} '
-            f'and {data.act_dim}'
-        )
-    made_for = agent.metadata.get('contract')
-    if fault := identity_fault(f'the dataset {dataset_file}', data.contract, made_for):
-        raise ValueError(f'{fault}, as the checkpoint {checkpoint_folder} is')
-    return Deployment(agent, TrajectoryFilter(data, settings.on(data.contract or made_for)))
+    agent.check(data)
+    made_for = data.contract or agent.metadata.get('contract')
+    return Deployment(agent, TrajectoryFilter(data, settings.on(made_for)))
 
 
 class Values(Protocol):
