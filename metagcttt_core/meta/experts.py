@@ -125,11 +125,11 @@ def make_inner_loops(
 
 def adapts_together(agent: Agent, config: MetaConfig) -> bool:
     """True if adapting the tasks of a meta-batch together is faster."""
-    if config.precision != 'float32':
-        return False
+    if config.precision != 'float32' or config.engine in ('kernels', 'analytic'):
+        return False  # stacks have neither
     if agent.device.type != 'cpu':
         return config.meta_batch_size > 1
-    if config.engine != 'eager' and agent.analytic_loss(actor_only=config.actor_only) is not None:
+    if config.engine == 'auto' and agent.analytic_loss(actor_only=config.actor_only) is not None:
         return False  # gradients written out are faster one task after another
     weights = agent.trained_parameters(actor_only=config.actor_only)
     work = config.batch_size * sum(weight.numel() for weight in weights)

@@ -82,6 +82,14 @@ def test_tasks_are_stacked_where_that_is_faster():
     assert adapts_together(learned, quick(meta_batch_size=4, batch_size=64, engine='auto'))
 
 
+@pytest.mark.parametrize('engine', ['kernels', 'analytic'])
+def test_engine_that_is_named_is_used_or_refused(engine):
+    learned = tiny_agent(hidden=(32, 32), const_std=False)
+    config = quick(meta_batch_size=4, engine=engine)
+    with pytest.raises(ValueError, match=f'engine {engine}: agent gcbc has no loss written out'):
+        post_train(learned, random_dataset([20, 30, 25]), config)
+
+
 def test_first_task_of_a_meta_batch_is_the_only_one_of_a_batch_of_one():
     """Each task has a generator of its own: the first is that of a meta-batch of one."""
     agent, dataset = tiny_agent(), random_dataset([20, 30, 25])
