@@ -107,10 +107,33 @@ def test_policy_of_imported_data_is_for_no_maze_unless_one_is_named(program, tmp
     with pytest.raises(SystemExit, match='2'):
         environment('no', '--evaluate-every', '1')
     error = capsys.readouterr().err
-    assert f'made by {program}, which does not say of which simulator: evaluate_every' in error
+    assert f'{data}: does not say of which simulator it is: evaluate_every takes an' in error
     with pytest.raises(SystemExit, match='2'):
         evaluate.main(['--checkpoints', str(tmp_path / 'none/checkpoint'), '--dataset', str(data)])
     assert 'does not say which environment it is for' in capsys.readouterr().err
+
+
+def test_policy_of_data_of_other_widths_is_not_for_the_usual_maze(tmp_path, capsys):
+    data = tmp_path / 'arm.npz'
+    random_dataset([20], obs_dim=29, act_dim=8).save(data)
+
+    def environment(out, *flags):
+        pretrain.main([*pretrain_arguments(data, tmp_path / out, steps=1), *flags])
+        return load_checkpoint(tmp_path / out / 'checkpoint').metadata.get('environment')
+
+    assert environment('none') is None
+    assert environment('ant', '--environment', 'antmaze-medium-v0') == 'antmaze-medium-v0'
+    for flags, error in (
+        (
+            ('--environment', 'pointmaze-medium-v0'),
+            f'{data}: has observations of 29 and actions of 8 values, the robot of pointmaze-medi',
+        ),
+        (('--environment', 'antmaze-mediun-v0'), "did you mean 'antmaze-medium-v0'"),
+        (('--evaluate-every', '1'), f'{data}: does not say of which simulator it is'),
+    ):
+        with pytest.raises(SystemExit, match='2'):
+            environment('no', *flags)
+        assert error in ' '.join(capsys.readouterr().err.split())
 
 
 def test_pretrain_does_not_overwrite_a_checkpoint(dataset_path, base, capsys):

@@ -12,7 +12,8 @@ from metagcttt_core.agents import AgentName, AGENTS
 from metagcttt_core.agents.config import CRLOptions, GCBCOptions, GCIQLOptions, SAWOptions
 from metagcttt_core.plugins import PluginError
 from metagcttt_core.training.config import Precision, PretrainConfig
-from pydantic import create_model, Field, model_validator
+from pydantic import create_model, Field, field_validator, model_validator
+from sim_bridge.registry import describe_environment
 import tyro
 
 from metagcttt_tools.common.cli import fail, parse
@@ -48,7 +49,7 @@ class PretrainSettings(RunSettings):
     environment: str | None = Field(
         None,
         description=f'simulator the policy is for; by default {_USUAL_ENVIRONMENT}, and none for '
-        "data of a robot's contract or of an importer",
+        "data of other widths, of a robot's contract or of an importer",
     )
     out: Path = Field(Path('out/pretrain'), description='folder of the run')
     agent: AgentName = Field('gcbc', description='kind of agent')
@@ -79,6 +80,13 @@ class PretrainSettings(RunSettings):
     )
     evaluation_episodes: int = Field(10, ge=1, description='episodes per task of an evaluation')
 
+    @field_validator('environment')
+    @classmethod
+    def _known(cls, environment: str | None) -> str | None:
+        if environment:
+            describe_environment(environment)
+        return environment
+
     @property
     def steps(self) -> int:
         """Steps of the whole run."""
@@ -96,11 +104,8 @@ class PretrainSettings(RunSettings):
             dataset: The data.
 
         Raises:
-            DatasetError: If a simulator is asked for that the robot does not have.
+            DatasetError: If the simulator that was asked for is another robot's.
         """
-        program = (dataset.made_from or {}).get('program')
-        if not dataset.contract and program not in _OF_NO_MAZE:
-            return self.maze
         if dataset.contract:
             names = ('environment', 'evaluate_every')
             if asked := [name for name in names if getattr(self, name) is not None]:
@@ -108,12 +113,24 @@ class PretrainSettings(RunSettings):
                     f'{self.dataset}: of the robot {dataset.contract["robot"]}, which is in no '
                     f'maze: leave out {" and ".join(asked)}'
                 )
-        elif self.evaluate_every and not self.environment:
+            return None
+        spec = describe_environment(self.maze).spec
+        found, own = (dataset.obs_dim, dataset.act_dim), (spec.obs_dim, spec.act_dim)
+        if self.environment:
+            if found != own:
+                raise DatasetError(
+                    f'{self.dataset}: has observations of {found[0]} and actions of {found[1]} '
+                    f'values, the robot of {self.environment} has {own[0]} and {own[1]}'
+                )
+            return self.environment
+        if found == own and (dataset.made_from or {}).get('program') not in _OF_NO_MAZE:
+            return self.maze
+        if self.evaluate_every:
             raise DatasetError(
-                f'{self.dataset}: made by {program}, which does not say of which simulator: '
-                'evaluate_every takes an environment'
+                f'{self.dataset}: does not say of which simulator it is: evaluate_every takes an '
+                'environment'
             )
-        return self.environment
+        return None
 
     def decisive(self) -> dict[str, Any]:
         """The settings that decide the result, without those of other agents."""
