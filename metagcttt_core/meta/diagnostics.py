@@ -76,6 +76,7 @@ def _means(tasks: Sequence[TaskReport]) -> dict[str, float | None]:
         'inner/initial_loss': _mean([task.initial_loss for task in tasks]),
         'inner/expert_loss': _mean([task.expert_loss for task in tasks]),
         'task/support_transitions': _mean([task.num_transitions for task in tasks]),
+        'task/mean_steps': _mean([task.mean_steps for task in tasks]),
         'task/redraws': _mean([task.redraws for task in tasks]),
         'task/filter_ms': _mean([task.filter_ms for task in tasks]),
     }

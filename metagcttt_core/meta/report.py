@@ -14,6 +14,7 @@ class TaskReport:
     Attributes:
         goal: (obs_dim,) the goal g.
         num_transitions: Size of the filtered dataset.
+        mean_steps: Mean length of the kept sub-trajectories, in transitions.
         redraws: State-goal pairs discarded before this one because the filter found too little.
         filter_ms: Time of the filter's query.
         train_losses: (K,) loss of each step's batch before the step.
@@ -26,6 +27,7 @@ class TaskReport:
 
     goal: tuple[float, ...]
     num_transitions: int
+    mean_steps: float
     redraws: int
     filter_ms: float
     train_losses: list[float]
@@ -42,6 +44,7 @@ class TaskReport:
         return cls(
             goal=tuple(task.goal.tolist()),
             num_transitions=task.num_transitions,
+            mean_steps=task.mean_steps,
             redraws=task.redraws,
             filter_ms=task.train.milliseconds,
             train_losses=result.train_losses,

@@ -17,6 +17,7 @@ def report(
     *,
     train_losses=(0.0,),
     num_transitions=2,
+    mean_steps=1.0,
     redraws=0,
     ms=0.0,
     losses=(0.0, 0.0),
@@ -24,6 +25,7 @@ def report(
     return TaskReport(
         (0.0, 0.0),
         num_transitions,
+        mean_steps,
         redraws,
         ms,
         list(train_losses),
@@ -37,7 +39,13 @@ def test_record_by_hand():
     agent = tiny_agent()
     diagnostics = Diagnostics(agent)
     first = report(
-        0, [1.0, 2.0, 4.0], train_losses=[5.0, 1.0], num_transitions=30, ms=2.0, losses=(4, 3)
+        0,
+        [1.0, 2.0, 4.0],
+        train_losses=[5.0, 1.0],
+        num_transitions=30,
+        mean_steps=6.0,
+        ms=2.0,
+        losses=(4, 3),
     )
     second = report(
         1, [3.0, 2.0, 2.5], train_losses=[6.0, 2.0], num_transitions=50, redraws=1, losses=(6, 4)
@@ -59,6 +67,7 @@ def test_record_by_hand():
         'inner/initial_loss': 5,
         'inner/expert_loss': 3.5,
         'task/support_transitions': 40,
+        'task/mean_steps': 3.5,
         'task/redraws': 0.5,
         'task/filter_ms': 1.0,
         'meta/drift': pytest.approx(5.0, rel=1e-5),
@@ -94,5 +103,5 @@ def test_report_takes_its_numbers_from_task_and_result():
     )
     result = Adaptation(tiny_agent(), [5.0, 4.0], [3.0, 2.0, 1.0], best_step=2)
     assert TaskReport.of(task, result, 6.0, 1.5) == TaskReport(
-        (1.0, -2.0), 10, 3, 2.5, [5.0, 4.0], [3.0, 2.0, 1.0], 2, 6.0, 1.5
+        (1.0, -2.0), 10, 5.0, 3, 2.5, [5.0, 4.0], [3.0, 2.0, 1.0], 2, 6.0, 1.5
     )

@@ -28,8 +28,8 @@ def warnings_of(records):
 
 
 def outer_step(train_losses=(1.0, 2.0), test_losses=(3.0, 2.0, 1.0)) -> OuterStep:
-    good = TaskReport((0.0,), 10, 0, 1.0, [1.0, 1.0], [1.0, 1.0, 1.0], 0, 1.0, 1.0)
-    other = TaskReport((0.0,), 10, 0, 1.0, list(train_losses), list(test_losses), 2, 1.0, 1.0)
+    good = TaskReport((0.0,), 10, 5.0, 0, 1.0, [1.0, 1.0], [1.0, 1.0, 1.0], 0, 1.0, 1.0)
+    other = TaskReport((0.0,), 10, 5.0, 0, 1.0, list(train_losses), list(test_losses), 2, 1.0, 1.0)
     return OuterStep(7, [good, other])
 
 
