@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from metagcttt_core.robot.contract import CommandTopic, Contract, measured_columns
+from metagcttt_core.robot.contract import Contract
 from metagcttt_core.robot.errors import MessageError
 from metagcttt_core.robot.numbers import read_numbers, write_numbers
+from metagcttt_core.robot.topics import CommandTopic, measured_columns
 
 _ROUNDING = 1e-6
 """Share of a range by which single-precision commands may exceed it."""

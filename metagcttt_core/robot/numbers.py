@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from metagcttt_core.robot.contract import Numbers, ObservedValue
 from metagcttt_core.robot.errors import MessageError
+from metagcttt_core.robot.topics import Numbers, ObservedValue
 
 _UNIT_TOLERANCE = 1e-2
 _LARGEST = float(np.finfo(np.float32).max)

@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from metagcttt_core.robot.contract import Contract, ObservedTopic
+from metagcttt_core.robot.contract import Contract
 from metagcttt_core.robot.errors import MessageError
 from metagcttt_core.robot.numbers import observe
+from metagcttt_core.robot.topics import ObservedTopic
 
 
 @dataclass(frozen=True)

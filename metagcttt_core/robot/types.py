@@ -3,13 +3,8 @@
 from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
-from metagcttt_core.robot.contract import (
-    CommandTopic,
-    CommandValue,
-    Contract,
-    Numbers,
-    ObservedTopic,
-)
+from metagcttt_core.robot.contract import Contract
+from metagcttt_core.robot.topics import CommandTopic, CommandValue, Numbers, ObservedTopic
 
 _NUMBERS = frozenset(
     ['float', 'double', 'float32', 'float64']

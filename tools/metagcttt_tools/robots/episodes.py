@@ -10,7 +10,7 @@ from typing import Any
 from metagcttt_core.data import DatasetError, TrajectoryDataset
 from metagcttt_core.robot import Contract, MessageError, Observer
 from metagcttt_core.robot.commands import Limits, read_command
-from metagcttt_core.robot.contract import CommandTopic
+from metagcttt_core.robot.topics import CommandTopic
 import numpy as np
 
 from metagcttt_tools.robots.bag import Recorded

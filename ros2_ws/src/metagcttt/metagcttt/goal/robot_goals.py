@@ -7,8 +7,9 @@ import math
 
 from metagcttt_core import TrajectoryDataset
 from metagcttt_core.robot import Contract, identity_fault, MessageError
-from metagcttt_core.robot.contract import GoalSection, ObservedValue
+from metagcttt_core.robot.contract import GoalSection
 from metagcttt_core.robot.numbers import heading, transformed
+from metagcttt_core.robot.topics import ObservedValue
 import numpy as np
 from numpy.typing import NDArray
 

@@ -5,7 +5,7 @@ from importlib import import_module
 import re
 from typing import Any
 
-from metagcttt_core.robot.contract import Qos
+from metagcttt_core.robot.topics import Qos
 from metagcttt_core.robot.types import FieldType
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 

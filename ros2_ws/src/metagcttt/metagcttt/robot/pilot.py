@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from metagcttt_core.robot import Contract
 from metagcttt_core.robot.commands import Commander, split_action
-from metagcttt_core.robot.contract import CommandTopic
+from metagcttt_core.robot.topics import CommandTopic
 import numpy as np
 from numpy.typing import NDArray
 
