@@ -43,6 +43,8 @@ _TTT_PARAMETERS = {
     'guard': 'guard',
     'actor_only': 'actor_only',
     'optimizer_state': 'optimizer_state',
+    'engine': 'engine',
+    'precision': 'precision',
     'horizon': 'horizon',
 }
 _FILTER_PARAMETERS = {

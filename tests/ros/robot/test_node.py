@@ -46,7 +46,7 @@ class Rig:
             diagnostics_period_s=0.05,
             use_sim_time=use_sim_time,
         )
-        self.states: list[MazeState] = graph.collect(MazeState, 'state', ANY)
+        self.states: list[MazeState] = graph.collect(MazeState, 'state', RELIABLE)
         self.commands: list[Twist] = graph.collect(Twist, 'cmd_vel', RELIABLE)
         self.diagnostics = graph.collect(DiagnosticArray, '/diagnostics', RELIABLE)
         self._odometry = graph.node.create_publisher(Odometry, 'odom', RELIABLE)

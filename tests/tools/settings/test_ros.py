@@ -58,7 +58,7 @@ NO_PARAMETER = 'policy_node has no such parameter'
 WITHOUT_PARAMETER = {
     **{
         f'ttt.{name}': INNER_LOOP[name]
-        for name in ('optimizer', 'fix_actor_goal', 'ratio', 'engine', 'precision')
+        for name in ('optimizer', 'fix_actor_goal', 'ratio')
     },
     **{f'filter.{name}': FILTER[name] for name in ('top_k', 'position_dims', 'scale', 'slack')},
     'ttt.max_test': 1,
@@ -91,6 +91,8 @@ EVALUATE_ROS = Walk(
         'ttt.actor_only': True,
         'ttt.horizon': 2,
         'ttt.optimizer_state': 'pretrained',
+        'ttt.engine': 'eager',
+        'ttt.precision': 'bfloat16',
         'filter.variant': 'gcttt',
         'filter.epsilon': 9.0,
         'filter.top_percent': 50.0,

@@ -25,7 +25,7 @@ from metagcttt.health import Faults, Health, Level, Rate
 from metagcttt.input_checks import Senders
 from metagcttt.parameter_set import ParameterSet
 from metagcttt.parameters import ROBOT_BRIDGE_NODE
-from metagcttt.qos import COMMAND, keep_several, SENSOR
+from metagcttt.qos import COMMAND, keep_several, state_offer
 from metagcttt.robot.messages import definitions, message_class, profile
 from metagcttt.robot.pilot import Pilot, Situation
 
@@ -74,7 +74,7 @@ class RobotBridgeNode(ConventionalNode):
         self._step = 0
         self._ended = False
 
-        self._states = self.create_publisher(MazeState, 'state', keep_several(SENSOR))
+        self._states = self.create_publisher(MazeState, 'state', state_offer('realtime'))
         self._stamped = [has_header(topic.type, definitions) for topic in self._contract.act]
         self._commands = [
             self.create_publisher(message_class(topic.type), topic.topic, profile(topic.qos))
