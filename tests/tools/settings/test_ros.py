@@ -56,10 +56,7 @@ def watch_robot(patch: pytest.MonkeyPatch, seen: Seen) -> None:
 
 NO_PARAMETER = 'policy_node has no such parameter'
 WITHOUT_PARAMETER = {
-    **{
-        f'ttt.{name}': INNER_LOOP[name]
-        for name in ('optimizer', 'fix_actor_goal', 'ratio')
-    },
+    **{f'ttt.{name}': INNER_LOOP[name] for name in ('optimizer', 'fix_actor_goal', 'ratio')},
     **{f'filter.{name}': FILTER[name] for name in ('top_k', 'position_dims', 'scale', 'slack')},
     'ttt.max_test': 1,
     'filter.min_steps': 60,
