@@ -120,6 +120,7 @@ def main(argv: list[str] | None = None) -> None:
         picture = settings.out.with_suffix('.png')
         with sole_writer(settings.out, settings.out, picture):
             known = [read_success(path) for path in settings.against]
+            marks = identities(settings.dataset, settings.checkpoints)
             source, train, held_out = split(settings)
             queries = draw_queries(
                 held_out,
@@ -133,7 +134,7 @@ def main(argv: list[str] | None = None) -> None:
             report = {
                 'settings': settings.model_dump(mode='json'),
                 **provenance(),
-                **identities(settings.dataset, settings.checkpoints),
+                **marks,
                 'held_out': source,
                 'results': results,
             }
@@ -182,10 +183,6 @@ def run(
     queries: Sequence[Query],
 ) -> dict[Arm, list[Outcome]]:
     """The outcomes of all queries by arm."""
-    from metagcttt_core import load_checkpoint
-
-    for path in settings.checkpoints:
-        load_checkpoint(path).check(train)
     radius = settings.filter.on(train.contract).epsilon
     arms = [
         Arm(str(path), epsilon, lr)

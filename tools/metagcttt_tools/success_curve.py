@@ -14,7 +14,7 @@ from pydantic import Field
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.results import markdown_table, start_column, write_report
 from metagcttt_tools.common.session import snapshot_folder, SNAPSHOTS, sole_writer
-from metagcttt_tools.common.sources import fingerprints
+from metagcttt_tools.common.sources import identities
 from metagcttt_tools.evaluate import (
     evaluate,
     EvaluateSettings,
@@ -61,7 +61,8 @@ def main(argv: list[str] | None = None) -> None:
         )
         picture = settings.out.with_suffix('.png')
         with sole_writer(settings.out, settings.out, picture):
-            marks = fingerprints(evaluation.dataset, evaluation.checkpoints, evaluation.actor_loss)
+            known = identities(evaluation.dataset, evaluation.checkpoints, evaluation.actor_loss)
+            marks = known['fingerprints']
             done = finished_before(settings, marks)
             rows = done['results']['curve'] if done else _rows(evaluation, settings, steps, marks)
             if not done:

@@ -1,7 +1,7 @@
 """What a report says of its data and policies."""
 
 from metagcttt_core import save_checkpoint
-from metagcttt_tools.common.sources import identities, unchanged
+from metagcttt_tools.common.sources import fingerprints, identities, unchanged
 import pytest
 from tests.core.builders import random_dataset, tiny_agent
 
@@ -31,6 +31,14 @@ def test_policy_that_is_replaced_meanwhile_is_refused(files):
         save_checkpoint(tiny_agent(seed=1), files[1][0])
 
 
-def test_data_that_are_replaced_meanwhile_are_refused(files):
+@pytest.mark.parametrize('change', [{'seed': 1}, {'obs_dim': 3}])
+def test_data_that_are_replaced_meanwhile_are_refused(change, files):
     with pytest.raises(ValueError, match='is of other dataset, was '), unchanged(*files):
-        random_dataset(seed=1).save(files[0])
+        random_dataset(**change).save(files[0])
+
+
+def test_data_for_another_policy_have_no_identities_with_it(files):
+    random_dataset(obs_dim=3).save(files[0])
+    with pytest.raises(ValueError, match=f'^{files[1][0]} is for observations of 2 and actions'):
+        identities(*files)
+    assert list(fingerprints(*files)) == ['dataset', 'policies']

@@ -4,10 +4,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 import hashlib
 from pathlib import Path
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from metagcttt_core import TrajectoryDataset
 from metagcttt_core.agents.config import ActorLoss
+
+if TYPE_CHECKING:
+    from metagcttt_core import Agent
 
 _BLOCK = 1 << 20
 
@@ -41,17 +44,11 @@ def identities(
     Raises:
         ValueError: If one cannot be read, or the data are none for a policy; see `Agent.check`.
     """
-    from metagcttt_core import load_checkpoint
-
-    changes = {'actor_loss': actor_loss} if actor_loss else {}
-    # First, as they are read sooner than data.
-    agents = [load_checkpoint(path, changes=changes) for path in checkpoints]
-    data = TrajectoryDataset.load(dataset)
+    data, agents = _read(dataset, checkpoints, actor_loss)
     for agent in agents:
         agent.check(data)
-    policies = [agent.fingerprint() for agent in agents]
     made_from = {'made_from': data.made_from} if data.made_from else {}
-    return {'fingerprints': {'dataset': data.fingerprint, 'policies': policies}, **made_from}
+    return {'fingerprints': _hashes(data, agents), **made_from}
 
 
 @contextmanager
@@ -69,9 +66,23 @@ def unchanged(dataset: Path, checkpoints: Sequence[Path]) -> Iterator[dict[str, 
 def fingerprints(
     dataset: Path, checkpoints: Sequence[Path], actor_loss: ActorLoss | None = None
 ) -> dict[str, Any]:
-    """Hashes of a dataset and of policies, as they are adapted; see `identities`."""
-    found: dict[str, Any] = identities(dataset, checkpoints, actor_loss)['fingerprints']
-    return found
+    """Hashes of a dataset and of policies, as they are adapted, whether they fit or not."""
+    return _hashes(*_read(dataset, checkpoints, actor_loss))
+
+
+def _read(
+    dataset: Path, checkpoints: Sequence[Path], actor_loss: ActorLoss | None
+) -> tuple[TrajectoryDataset, list['Agent']]:
+    from metagcttt_core import load_checkpoint
+
+    changes = {'actor_loss': actor_loss} if actor_loss else {}
+    # First, as they are read sooner than data.
+    agents = [load_checkpoint(path, changes=changes) for path in checkpoints]
+    return TrajectoryDataset.load(dataset), agents
+
+
+def _hashes(data: TrajectoryDataset, agents: Sequence['Agent']) -> dict[str, Any]:
+    return {'dataset': data.fingerprint, 'policies': [agent.fingerprint() for agent in agents]}
 
 
 def check_fingerprints(file: Path, report: Mapping[str, Any], now: Mapping[str, Any]) -> None:
