@@ -25,6 +25,8 @@ pytestmark = pytest.mark.mujoco
 
 # Enough for the untrained policy to move along, so that the episodes are not trivial.
 TTT = {'adapt_steps': 60, 'adapt_lr': 0.01, 'adapt_batch_size': 64}
+# A goal that a busy machine repeats too late would be taken up anew, with another query.
+PATIENT = {'goal_lease_s': 0.0}
 
 
 def offline_episode(
@@ -100,7 +102,7 @@ def test_nodes_in_one_process_equal_the_offline_episode(
 ) -> None:
     files = {'dataset': str(dataset_file), 'stepping': 'lockstep'}
     graph.add(SimBridgeNode, stepping='lockstep')
-    graph.add(GoalNode, **files)
+    graph.add(GoalNode, **PATIENT, **files)
     policy = {'checkpoint': str(checkpoint_folder), 'horizon': horizon, 'threads': 1}
     graph.add(PolicyNode, adaptation='hold', **policy, **TTT, **files)
     record = Record(graph, EVERY)
@@ -122,7 +124,7 @@ def test_processes_over_dds_equal_the_offline_episode(
     files = {'dataset': dataset_file, 'stepping': 'lockstep'}
     policy = {'checkpoint': checkpoint_folder, 'adaptation': 'hold', 'threads': 1, **TTT}
     start_process('policy_node', **policy, **files)
-    start_process('goal_node', **files)
+    start_process('goal_node', **PATIENT, **files)
     start_process('sim_bridge_node', stepping='lockstep')
     record = Record(graph, EVERY)
     graph.wait_for_publishers()
