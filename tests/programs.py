@@ -53,5 +53,6 @@ def _run(arguments: list[str], cwd: Path, environment: dict[str, str], output: P
     os.chdir(cwd)
     os.environ.clear()
     os.environ.update(environment)
+    sys.path[:0] = filter(None, environment.get('PYTHONPATH', '').split(os.pathsep))
     sys.argv = ['metagcttt', *arguments]
     main(arguments)

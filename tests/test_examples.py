@@ -12,6 +12,9 @@ import numpy as np
 from PIL import Image
 import pytest
 
+from tests import programs
+from tests.programs import Ended
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -26,15 +29,8 @@ def guests(tmp_path_factory) -> Path:
     return folder / 'installed'
 
 
-def metagcttt(arguments: list[str], folder: Path, guests: Path) -> subprocess.CompletedProcess:
-    path = os.pathsep.join(map(str, (guests, ROOT, ROOT / 'tools')))
-    return subprocess.run(
-        [sys.executable, '-m', 'metagcttt_tools', *arguments],
-        cwd=folder,
-        env={**os.environ, 'PYTHONPATH': path},
-        capture_output=True,
-        text=True,
-    )
+def metagcttt(arguments: list[str], folder: Path, guests: Path) -> Ended:
+    return programs.metagcttt(arguments, folder, {**os.environ, 'PYTHONPATH': str(guests)})
 
 
 def test_agent_of_another_package_trains_with_its_settings_and_adapts(tmp_path, guests) -> None:
@@ -48,21 +44,21 @@ def test_agent_of_another_package_trains_with_its_settings_and_adapts(tmp_path, 
     data = ['--dataset', 'mine.npz']
     flags = ['--agent', 'huber', '--huber.delta', '0.5', '--hidden', '8', '--training.steps', '2']
     run = metagcttt(['pretrain', *data, *flags, '--out', 'base'], tmp_path, guests)
-    assert run.returncode == 0, run.stderr
+    assert run.returncode == 0, run.output
     index = json.loads((tmp_path / 'base' / 'checkpoint' / 'checkpoint.json').read_text())
     assert index['agent'] == 'huber'
     assert index['settings']['delta'] == 0.5
     more = ['pretrain', '--out', 'base', '--resume', '--training.steps', '3']
     run = metagcttt(more, tmp_path, guests)
-    assert run.returncode == 0, run.stderr
+    assert run.returncode == 0, run.output
     policy = ['--checkpoint', 'base/checkpoint', '--out', 'meta']
     steps = ['--meta.outer-steps', '1', '--meta.inner-steps', '1']
     run = metagcttt(['meta-train', *data, *policy, *steps], tmp_path, guests)
-    assert run.returncode == 0, run.stderr
+    assert run.returncode == 0, run.output
 
 
 def test_help_offers_the_agent_and_its_settings(tmp_path, guests) -> None:
-    text = metagcttt(['pretrain', '--help'], tmp_path, guests).stdout
+    text = metagcttt(['pretrain', '--help'], tmp_path, guests).output
     assert '--agent {crl,gcbc,gciql,saw,huber}' in text
     assert '--huber.delta' in text
 
@@ -71,10 +67,10 @@ def test_misspelt_agent_is_refused_with_the_known_ones(tmp_path, guests) -> None
     (tmp_path / 'mine.yaml').write_text('pretrain: {agent: hubert}')
     run = metagcttt(['pretrain', '--preset', 'mine.yaml'], tmp_path, guests)
     assert run.returncode == 2
-    assert "unknown agent 'hubert'; did you mean 'huber'?" in run.stderr
+    assert "unknown agent 'hubert'; did you mean 'huber'?" in run.output
     run = metagcttt(['pretrain', '--agent', 'hubert'], tmp_path, guests)
     assert run.returncode == 2
-    assert 'huber' in run.stderr
+    assert 'huber' in run.output
 
 
 SCRIPTS = {

@@ -1,5 +1,6 @@
 """Other ways to compute a loss: bfloat16 under autocast, and compiled."""
 
+from functools import partial
 from types import SimpleNamespace
 
 from metagcttt_core import make_agent
@@ -62,8 +63,19 @@ def test_float32_is_the_agent_s_own_loss():
 
 @pytest.mark.slow
 def test_compiled_loss_and_gradients_equal_the_plain_ones():
-    agent, batch = agent_and_batch('gciql', {'actor_loss': 'ddpgbc'}, hidden=(16,))
-    compiled = loss_function(agent, compiled=True)
+    agent, batch = agent_and_batch('gcbc', {}, hidden=(16,))
+    assert_same_losses_and_gradients(agent, loss_function(agent, compiled=True), batch)
+
+
+@LEARNERS
+def test_what_the_compiler_captures_computes_the_same(name, settings, monkeypatch):
+    captured = partial(torch.compile, backend='aot_eager')  # without half a minute of C++
+    monkeypatch.setattr(torch, 'compile', lambda losses, options: captured(losses))
+    agent, batch = agent_and_batch(name, settings, hidden=(16,))
+    assert_same_losses_and_gradients(agent, loss_function(agent, compiled=True), batch)
+
+
+def assert_same_losses_and_gradients(agent, compiled, batch):
     assert compiled(batch)[0].item() == pytest.approx(agent.losses(batch)[0].item(), rel=1e-5)
     plain, fused = (gradients(agent, losses, batch) for losses in (agent.losses, compiled))
     for key, gradient in plain.items():
