@@ -105,7 +105,8 @@ def test_pages_and_tables_are_those_of_the_results(tmp_path, capsys):
 TABLES = [
     ('docs/results/README.md', 'pointmaze-medium-navigate-study.json', 'ttt', {
         'base': 'base', 'continual': 'CONTINUAL-TTT', 'fomaml': 'TT-FOMAML',
-        'reptile': 'TT-REPTILE',
+        'reptile': 'TT-REPTILE', 'continual-far': 'CONTINUAL-TTT, far tasks',
+        'fomaml-far': 'TT-FOMAML, far tasks', 'reptile-far': 'TT-REPTILE, far tasks',
     }),
     ('docs/results/README.md', 'antmaze-medium-navigate-study.json', 'ttt', {
         'base': 'base', 'continual': 'CONTINUAL-TTT', 'fomaml': 'TT-FOMAML',
@@ -135,9 +136,22 @@ def test_tables_of_studies_in_the_documents(document, name, adaptation, labels):
 def test_table_of_the_small_policies_in_the_readme():
     text = squeezed((ROOT / 'README.md').read_text())
     results = read('pointmaze-medium-navigate-cpu.json')['results']
-    for label, result in zip(('base', 'post-trained (TT-REPTILE)'), results, strict=True):
+    for label, result in zip(
+        ('base', 'post-trained (TT-REPTILE, far tasks)'), results, strict=True
+    ):
         cells = [f'{p["success"]:.2f} ± {p["standard_error"]:.2f}' for p in result['curve']]
         assert f'| {label} | {" | ".join(cells)} | {result["auc"]:.3f} |' in text
+
+
+def test_table_of_both_precisions_in_the_guide():
+    text = squeezed((ROOT / 'docs/guide.md').read_text())
+    for precision, name in (('float32', 'cpu'), ('bfloat16', 'bfloat16')):
+        report = read(f'pointmaze-medium-navigate-{name}.json')
+        assert report['settings']['ttt']['precision'] == precision
+        for label, result in zip(('base', 'post-trained'), report['results'], strict=True):
+            adapted = [p for p in result['curve'] if p['budget'] > 0]
+            cells = [f'{p["success"]:.2f} ± {p["standard_error"]:.2f}' for p in adapted]
+            assert f'| {label} | {precision} | {" | ".join(cells)} |' in text
 
 
 @pytest.mark.parametrize(

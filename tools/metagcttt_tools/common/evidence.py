@@ -88,11 +88,12 @@ def format_evidence(evidence: Evidence) -> str:
         for artefact in evidence.artefacts
         if artefact.files
     ]
-    dirty = ', '.join(evidence.from_dirty_trees)
     parts = [
         *(_INTRODUCTION, markdown_table(claims)),
         *('## What was run', markdown_table(runs)),
         *('## Rates that differ from Table 3', evidence.other_rates.strip()),
-        *('## To be made anew', f'From trees with uncommitted changes: {dirty}.'),
     ]
+    if evidence.from_dirty_trees:
+        dirty = ', '.join(evidence.from_dirty_trees)
+        parts += ['## To be made anew', f'From trees with uncommitted changes: {dirty}.']
     return '\n\n'.join(parts) + '\n'

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 import io
-from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -234,9 +233,9 @@ def interquartile_picture(adaptations: Mapping[str, Mapping[str, Any]]) -> Figur
     figure = Figure(figsize=(11, 3.4 * rows), layout='constrained')
     panels = figure.subplots(rows, 2, squeeze=False)
     for row, (name, arms) in zip(panels, adaptations.items(), strict=True):
-        for color, (arm, summary) in zip(cycle(COLORS), arms.items(), strict=False):
+        for number, (arm, summary) in enumerate(arms.items()):
             places = np.arange(len(summary['budgets']))
-            shift = 0.8 / len(arms) * (list(arms).index(arm) - (len(arms) - 1) / 2)
+            shift = 0.8 / len(arms) * (number - (len(arms) - 1) / 2)
             for axes, figures in zip(row, ('interquartile_mean', 'improvement'), strict=True):
                 if figures in summary.get('robust', {}):
                     value, low, high = np.array(summary['robust'][figures]).T
@@ -244,9 +243,9 @@ def interquartile_picture(adaptations: Mapping[str, Mapping[str, Any]]) -> Figur
                         places + shift,
                         value,
                         yerr=(value - low, high - value),
-                        color=color,
+                        color=COLORS[number % len(COLORS)],
                         label=arm,
-                        marker='o',
+                        marker='os^'[number // len(COLORS) % 3],
                         markersize=4,
                         linestyle='',
                     )
