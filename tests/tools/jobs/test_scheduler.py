@@ -1,12 +1,15 @@
 """Jobs on this machine: begun again when they are lost, stopped when they should be."""
 
+import _thread
 from pathlib import Path
+import signal
 import sys
 import threading
+import time
 
 from metagcttt_tools.common.stopping import Stop
 from metagcttt_tools.jobs import program
-from metagcttt_tools.jobs.program import Invocation, JobError
+from metagcttt_tools.jobs.program import Invocation, JobError, JobStoppedError, run_program
 from metagcttt_tools.jobs.scheduler import Job, LocalScheduler, run_all
 import pytest
 
@@ -60,6 +63,27 @@ def test_stop_makes_jobs_save_and_starts_no_more(job, tmp_path):
         run_all('jobs', [first, second], LocalScheduler(1, retries=5), stop)
     assert (tmp_path / 'saved').exists()
     assert not (tmp_path / 'second.ran').exists()
+
+
+def test_further_interrupts_do_not_cut_saving_short(job, tmp_path):
+    saves = 'signal.signal(15, lambda *_: (time.sleep(1), pathlib.Path("saved").touch())); '
+    stopped = job(f'import time; {saves} pathlib.Path("runs").touch(); signal.pause()')
+
+    def interrupt():
+        while not (tmp_path / 'runs').exists():
+            time.sleep(0.01)
+        for _ in range(3):
+            _thread.interrupt_main()
+            time.sleep(0.2)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        threading.Thread(target=interrupt).start()
+        with pytest.raises(JobStoppedError):
+            run_program(stopped.invocation)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert (tmp_path / 'saved').exists()
 
 
 def test_jobs_at_the_same_time_fit_the_cores(job):

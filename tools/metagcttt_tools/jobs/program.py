@@ -1,6 +1,7 @@
 """One run of a program as a process of its own."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 import shutil
 import signal
@@ -60,6 +61,13 @@ class JobStoppedError(Exception):
     """A program was told to stop, and saved what it did."""
 
 
+def _await_end(process: subprocess.Popen[bytes]) -> None:
+    """Wait until a program has saved, however often that is interrupted."""
+    while process.returncode is None:
+        with suppress(KeyboardInterrupt):
+            process.wait()
+
+
 def run_program(job: Invocation, stopped: Callable[[], bool] = lambda: False) -> None:
     """Run a program to its end.
 
@@ -108,7 +116,7 @@ def run_program(job: Invocation, stopped: Callable[[], bool] = lambda: False) ->
         if was_stopped:
             # Ray blocks SIGINT, and shells ignore it in the background; programs inherit both.
             process.send_signal(signal.SIGTERM)
-            process.wait()
+            _await_end(process)
             raise JobStoppedError(job.program)
     if process.returncode == 0:
         return
