@@ -77,7 +77,7 @@ def test_a_driven_robot_is_recorded_and_becomes_a_dataset(
         yaw = np.unwrap(np.arctan2(dataset.observations[:, 3], dataset.observations[:, 2]))
         row = row[np.abs(dataset.actions[row, 1]) > 0.2]
         turned = np.sign(yaw[row + 1] - yaw[row])
-        # Not always: an obstacle in the way turns the robot, too, in some drives a quarter of the time.
+        # Not always: an obstacle in the way turns the robot, too, in some drives often.
         assert np.mean(turned == np.sign(dataset.actions[row, 1])) > 0.65
 
 
