@@ -13,7 +13,6 @@ from PIL import Image
 import pytest
 
 from tests import programs
-from tests.programs import Ended
 
 ROOT = Path(__file__).parents[1]
 
@@ -29,7 +28,7 @@ def guests(tmp_path_factory) -> Path:
     return folder / 'installed'
 
 
-def metagcttt(arguments: list[str], folder: Path, guests: Path) -> Ended:
+def metagcttt(arguments: list[str], folder: Path, guests: Path) -> programs.Ended:
     return programs.metagcttt(arguments, folder, {**os.environ, 'PYTHONPATH': str(guests)})
 
 
