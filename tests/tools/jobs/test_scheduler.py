@@ -1,6 +1,7 @@
 """Jobs on this machine: begun again when they are lost, stopped when they should be."""
 
 import _thread
+from concurrent.futures import Future
 from pathlib import Path
 import signal
 import sys
@@ -63,6 +64,17 @@ def test_stop_makes_jobs_save_and_starts_no_more(job, tmp_path):
         run_all('jobs', [first, second], LocalScheduler(1, retries=5), stop)
     assert (tmp_path / 'saved').exists()
     assert not (tmp_path / 'second.ran').exists()
+
+
+def test_a_job_that_somebody_else_stopped_is_not_taken_for_done(job):
+    class Cancelled(LocalScheduler):
+        def submit(self, job):
+            future = Future()
+            future.set_exception(JobStoppedError(job.invocation.program))
+            return future
+
+    with pytest.raises(JobStoppedError):
+        run_all('jobs', [job('pass')], Cancelled(1, retries=0), Stop())
 
 
 def test_further_interrupts_do_not_cut_saving_short(job, tmp_path):

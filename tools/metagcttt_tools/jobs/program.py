@@ -57,7 +57,7 @@ class JobLostError(Exception):
     """A program was killed or asked for another turn: the next attempt goes on from there."""
 
 
-class JobStoppedError(Exception):
+class JobStoppedError(JobError):
     """A program was told to stop, and saved what it did."""
 
 
@@ -117,7 +117,7 @@ def run_program(job: Invocation, stopped: Callable[[], bool] = lambda: False) ->
             # Ray blocks SIGINT, and shells ignore it in the background; programs inherit both.
             process.send_signal(signal.SIGTERM)
             _await_end(process)
-            raise JobStoppedError(job.program)
+            raise JobStoppedError(f'{" ".join(job.command)} was told to stop')
     if process.returncode == 0:
         return
     ended = f'{" ".join(job.command)} ended with status {process.returncode}'

@@ -111,6 +111,7 @@ def run_all(name: str, jobs: Sequence[Job], scheduler: Scheduler, stop: Stop) ->
     Raises:
         KeyboardInterrupt: If `stop` was set; the runs have saved what they did.
         JobError: If a run failed.
+        JobStoppedError: If somebody else stopped a run.
     """
     futures = {scheduler.submit(job): job for job in jobs}
     pending = set(futures)
@@ -121,9 +122,10 @@ def run_all(name: str, jobs: Sequence[Job], scheduler: Scheduler, stop: Stop) ->
             done, pending = wait(pending, timeout=0.5, return_when=FIRST_COMPLETED)
             for future in done:
                 error = future.exception()
+                asked = failure is not None or stop.is_set()
                 if error is None:
                     ended.append(futures[future])
-                elif not isinstance(error, JobStoppedError):
+                elif not (asked and isinstance(error, JobStoppedError)):
                     failure = failure or error
             if failure is not None or stop.is_set():
                 scheduler.stop()
