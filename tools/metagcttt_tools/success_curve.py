@@ -139,21 +139,18 @@ def curve_picture(rows: Sequence[dict[str, Any]]) -> Figure:
     """Success against pre-training steps, one line a budget with its standard error."""
     from matplotlib.figure import Figure
 
-    from metagcttt_tools.common.plots import COLORS
+    from metagcttt_tools.common.plots import draw_line
 
     figure = Figure(figsize=(5, 3.5), layout='constrained')
     axes = figure.subplots()
     for number, budget in enumerate(dict.fromkeys(row['budget'] for row in rows)):
-        color = COLORS[number % len(COLORS)]
         line = [row for row in rows if row['budget'] == budget]
         x, mean, error = (
             np.array([row[key] for row in line]) for key in ('step', 'success', 'standard_error')
         )
-        axes.plot(x, mean, color=color, marker='o', markersize=3.5, label=f'K = {budget}')
-        axes.fill_between(x, mean - error, mean + error, color=color, alpha=0.15, linewidth=0)
+        draw_line(axes, x, (mean, mean - error, mean + error), f'K = {budget}', number)
     axes.set_ylim(-0.02, 1.02)
     axes.set_xlabel('pre-training steps')
     axes.set_ylabel('success')
-    axes.grid(alpha=0.25)
     axes.legend(frameon=False)
     return figure

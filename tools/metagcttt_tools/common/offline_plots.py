@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 
-from metagcttt_tools.common.plots import COLORS
+from metagcttt_tools.common.plots import draw_line
 
 
 def offline_picture(results: list[dict[str, Any]]) -> Figure:
@@ -36,14 +36,13 @@ def offline_picture(results: list[dict[str, Any]]) -> Figure:
         left.legend(frameon=False, fontsize=6)
     for axes in (left, right):
         axes.set(xlabel='steps of test-time training K', ylabel='action error (rms)')
-        axes.grid(alpha=0.25)
     return figure
 
 
 def _line(axes: Axes, rows: list[dict[str, Any]], label: str, number: int) -> None:
-    color, style = COLORS[number % len(COLORS)], ('-', '--', ':')[number // len(COLORS) % 3]
     x = np.arange(len(rows))
-    mean, low, high = (np.array([r['error'][k] for r in rows]) for k in ('mean', 'low', 'high'))
-    axes.plot(x, mean, style, color=color, marker='o', markersize=3, label=label)
-    axes.fill_between(x, low, high, color=color, alpha=0.12, linewidth=0)
+    values = tuple(
+        np.array([row['error'][key] for row in rows]) for key in ('mean', 'low', 'high')
+    )
+    draw_line(axes, x, values, label, number)
     axes.set_xticks(x, [str(row['budget']) for row in rows])

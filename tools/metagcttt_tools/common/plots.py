@@ -214,13 +214,33 @@ def post_training_curves(curve: Mapping[str, Mapping[float, Mapping[str, Any]]])
 def _success_line(
     axes: Axes, x: np.ndarray, curve: Mapping[str, Any], label: str, number: int
 ) -> None:
-    color = COLORS[number % len(COLORS)]
-    style = ('-', '--', ':')[number // len(COLORS) % 3]
     mean, error = np.array(curve['success']), np.array(curve['standard_error'])
-    axes.plot(x, mean, color=color, linestyle=style, marker='o', markersize=3.5, label=label)
-    axes.fill_between(x, mean - error, mean + error, color=color, alpha=0.15, linewidth=0)
+    draw_line(axes, x, (mean, mean - error, mean + error), label, number)
     axes.set_ylim(-0.02, 1.02)
+
+
+def draw_line(
+    axes: Axes, x: np.ndarray, values: tuple[np.ndarray, ...], label: str, number: int
+) -> None:
+    """Draw a line and the band around it.
+
+    Args:
+        axes: Where.
+        x: Shape (points,).
+        values: Line, lower and upper bound, each of shape (points,).
+        label: Its name in the legend.
+        number: Which line of the axes it is: the same number looks the same everywhere.
+    """
+    mean, low, high = values
+    color, style = COLORS[number % len(COLORS)], _choose(('-', '--', ':'), number)
+    axes.plot(x, mean, color=color, linestyle=style, marker='o', markersize=3.5, label=label)
+    axes.fill_between(x, low, high, color=color, alpha=0.15, linewidth=0)
     axes.grid(alpha=0.25)
+
+
+def _choose(looks: tuple[str, ...], number: int) -> str:
+    """What tells apart, in black and white too, the lines that share a color."""
+    return looks[number // len(COLORS) % len(looks)]
 
 
 def interquartile_picture(adaptations: Mapping[str, Mapping[str, Any]]) -> Figure:
@@ -245,7 +265,7 @@ def interquartile_picture(adaptations: Mapping[str, Mapping[str, Any]]) -> Figur
                         yerr=(value - low, high - value),
                         color=COLORS[number % len(COLORS)],
                         label=arm,
-                        marker='os^'[number // len(COLORS) % 3],
+                        marker=_choose(('o', 's', '^'), number),
                         markersize=4,
                         linestyle='',
                     )
