@@ -56,6 +56,7 @@ PROGRAMS: dict[str, Program | Group] = {
     'evaluate-robot': Program('evaluate_robot', 'Success on a simulated robot, by its contract.'),
     'sweep': Program('sweep', 'Run a whole study: training, post-training, evaluation.'),
     'report': Program('report', 'Tables and figures of a study.'),
+    'compare': Program('compare', 'Compare evaluations in one table and picture.'),
     'demo': Program('demo', 'Drive the point maze over ROS 2: three policies, five goals.'),
     'view': Program('view', 'Watch a running robot in a browser and send goals by a click.'),
     'doctor': Program('doctor', 'What works on this machine, and how to mend the rest.'),

@@ -6,8 +6,17 @@ import sys
 from types import ModuleType, SimpleNamespace
 
 from metagcttt_core.evaluation import offline, rollout
-from metagcttt_tools import draw_episodes, evaluate, evaluate_offline, loss_curves, report, sweep
+from metagcttt_tools import (
+    compare,
+    draw_episodes,
+    evaluate,
+    evaluate_offline,
+    loss_curves,
+    report,
+    sweep,
+)
 from metagcttt_tools.common import plots
+from metagcttt_tools.common.results import Results
 import pytest
 from tests.tools.settings.walk import (
     FILTER,
@@ -252,7 +261,26 @@ REPORT = Walk(
     watch_report,
 )
 
-WALKS = (EVALUATE, OFFLINE, SUCCESS_CURVE, DRAW, LOSSES, STUDY, REPORT)
+
+def watch_comparison(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    def read(path):
+        seen.append(path)
+        curve = [{'budget': 0, 'success': 0.5}]
+        policies = [{'checkpoint': name, 'curve': curve} for name in ('base-0', 'reptile-0')]
+        return Results(results=policies)
+
+    patch.setattr(compare, 'read_evaluation', read)
+    patch.setattr(plots, 'save', lambda figure, path: seen.append(path))
+
+
+COMPARE = Walk(
+    'compare',
+    {'evaluations': {'GCBC': 'gcbc.json'}},
+    {'evaluations': {'SAW': 'saw.json'}, 'policies': 'base', 'out': 'elsewhere'},
+    watch_comparison,
+)
+
+WALKS = (EVALUATE, OFFLINE, SUCCESS_CURVE, DRAW, LOSSES, STUDY, REPORT, COMPARE)
 
 
 @walks_through(WALKS)

@@ -174,10 +174,11 @@ def success_curves(adaptations: Mapping[str, Mapping[str, Mapping[str, Any]]]) -
     figure = Figure(figsize=(0.6 + 4.4 * len(adaptations), 3.6), layout='constrained')
     panels = np.atleast_1d(figure.subplots(1, len(adaptations), sharey=True))
     for axes, (name, arms) in zip(panels, adaptations.items(), strict=True):
+        budgets = sorted({budget for curve in arms.values() for budget in curve['budgets']})
         for number, (arm, curve) in enumerate(arms.items()):
-            positions = np.arange(len(curve['budgets']))
+            positions = np.searchsorted(budgets, curve['budgets'])
             _success_line(axes, positions, curve, arm, number)
-            axes.set_xticks(positions, [str(budget) for budget in curve['budgets']])
+        axes.set_xticks(range(len(budgets)), [str(budget) for budget in budgets])
         axes.set_xlabel('steps of test-time training K')
         if len(adaptations) > 1:
             axes.set_title(name)

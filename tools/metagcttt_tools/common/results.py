@@ -24,12 +24,14 @@ class Point(BaseModel):
 class PolicyResult(BaseModel):
     """Success of one policy, in a file of results."""
 
+    checkpoint: str = ''
     curve: Annotated[tuple[Point, ...], Field(min_length=1)]
 
 
 class Results(BaseModel):
     """What is read again of the file that `metagcttt evaluate` writes."""
 
+    settings: dict[str, Any] = {}
     results: tuple[PolicyResult, ...]
 
 
