@@ -84,8 +84,8 @@ def test_a_driven_robot_is_recorded_and_becomes_a_dataset(
     assert dataset.num_rows > 100
     if robot == 'diffbot':
         # The command of a row is in force in the period after it, which it explains; until the
-        # driver is there and has planned, periods pass without commands. The robot takes up to half
-        # a second from one side to the other.
+        # driver is there and has planned, periods pass without commands. From one side to the
+        # other the robot takes up to half a second.
         command = dataset.actions[:, 1]
         recent = np.lib.stride_tricks.sliding_window_view(command, 6)
         settled = np.pad((recent > 0.2).all(1) | (recent < -0.2).all(1), (5, 0))
