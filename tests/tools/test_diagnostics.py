@@ -58,6 +58,21 @@ def test_pictures_are_written_and_shown_in_tensorboard(tmp_path, capsys):
     assert 'warnings/text_summary' in tags['tensors']
 
 
+def test_the_figures_of_start_middle_and_end_are_kept(tmp_path):
+    write_run(tmp_path)
+    diagnostics.main(['--run', str(tmp_path), '--out', str(tmp_path / 'figures')])
+    figures = json.loads((tmp_path / 'figures' / 'diagnostics.json').read_text())['results']
+    assert list(figures) == ['start', 'middle', 'end']
+    assert figures['middle']['outer_steps'] == [14, 16]
+    end = figures['end']
+    assert (end['rejected'], end['one_step']) == (0.25, 0.25)
+    assert end['drift'] == pytest.approx(0.1)
+    np.testing.assert_allclose(end['losses']['train'], np.linspace(2, 1, 8), rtol=1e-5)
+    np.testing.assert_allclose(
+        end['losses']['test'], [2.0, 1.9, 1.5, 1.6, 1.7, 1.8, 1.8, 1.9, 1.9], rtol=1e-5
+    )
+
+
 def test_bars_and_shares_are_those_of_the_log(tmp_path):
     write_run(tmp_path)
     records = read_json_lines(tmp_path / 'metrics.jsonl')
@@ -88,9 +103,17 @@ def test_old_logs_and_unfinished_lines_are_read(tmp_path):
     diagnostics.main(['--run', str(tmp_path), '--out', str(out), '--no-tensorboard'])
     assert sorted(path.name for path in out.iterdir()) == [
         'best_steps.png',
+        'diagnostics.json',
         'inner_losses.png',
         'run.png',
     ]
+    figures = json.loads((out / 'diagnostics.json').read_text())['results']
+    assert figures['end'] == {
+        'outer_steps': [28, 30],
+        'rejected': 0.25,
+        'drift': pytest.approx(0.1),
+        'losses': {},
+    }
 
 
 def test_many_records_become_a_hundred_points():

@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from metagcttt_tools.common.cli import fail, parse
+from metagcttt_tools.common.results import write_report
 from metagcttt_tools.common.run_log import METRICS
 from metagcttt_tools.common.session import SETTINGS
 
@@ -23,7 +24,8 @@ if TYPE_CHECKING:
 _DESCRIPTION = """Draw what happened in a meta-post-training run, finished or not.
 
 Example: metagcttt diagnostics --run out/meta
-Writes best_steps.png, inner_losses.png and run.png to OUT and to the run's TensorBoard."""
+Writes best_steps.png, inner_losses.png and run.png to OUT and to the run's TensorBoard, and what
+they show of start, middle and end to OUT/diagnostics.json."""
 
 _POINTS = 100
 _GREY = '#9a9a9a'
@@ -58,9 +60,9 @@ def main(argv: list[str] | None = None) -> None:
             print(f'warning: after step {line["step"]}: {warning}')
     last_step = records[-1]['step']
     out = settings.out or settings.run / 'diagnostics'
-    pictures = [out / f'{name}.png' for name in PICTURES]
+    figures = out / 'diagnostics.json'
     try:
-        for path in pictures:
+        for path in (figures, *(out / f'{name}.png' for name in PICTURES)):
             refuse_foreign(*([] if settings.out else [settings.run / SETTINGS]), path)
     except FileExistsError as error:
         fail(str(error))
@@ -73,6 +75,38 @@ def main(argv: list[str] | None = None) -> None:
             writer.add_figure(f'diagnostics/{name}', figure, last_step)
     if writer:
         writer.close()
+    write_report(figures, settings, {name: summary(part) for name, part in parts(records).items()})
+    print(figures)
+
+
+def parts(records: Records) -> dict[str, Records]:
+    """The first, the middle and the last tenth of a run."""
+    share = max(1, len(records) // 10)
+    middle = (len(records) - share) // 2
+    return {
+        'start': records[:share],
+        'middle': records[middle : middle + share],
+        'end': records[-share:],
+    }
+
+
+def summary(records: Records) -> dict[str, Any]:
+    """Means over some outer steps of what the log has: shares of inner loops, drift and losses."""
+    logged = {
+        name: float(means([records], log_name)[0])
+        for name, log_name in (
+            ('rejected', 'inner/rejected'),
+            ('one_step', 'inner/one_step'),
+            ('drift', 'meta/drift'),
+        )
+        if any(log_name in record for record in records)
+    }
+    curves = {name: mean_curve(records, f'inner/{name}_loss_curve') for name in ('train', 'test')}
+    return {
+        'outer_steps': [records[0]['step'], records[-1]['step']],
+        **logged,
+        'losses': {name: each.tolist() for name, each in curves.items() if each is not None},
+    }
 
 
 def best_steps_picture(records: Records) -> Figure:
@@ -117,10 +151,7 @@ def inner_losses_picture(records: Records) -> Figure:
 
     figure = Figure(figsize=(10, 3.4), layout='constrained')
     panels = figure.subplots(1, 3, sharey=True)
-    share = max(1, len(records) // 10)
-    middle = (len(records) - share) // 2
-    parts = (records[:share], records[middle : middle + share], records[-share:])
-    for axes, part in zip(panels, parts, strict=True):
+    for axes, part in zip(panels, parts(records).values(), strict=True):
         train = mean_curve(part, 'inner/train_loss_curve')
         test = mean_curve(part, 'inner/test_loss_curve')
         if train is None:
