@@ -117,14 +117,22 @@ class MazeMap:
         Raises:
             ValueError: If a point lies outside the maze; names the first.
         """
+        counts = np.zeros(self.walls.shape, dtype=np.int64)
+        np.add.at(counts, tuple(self.cells(points).T), 1)
+        return counts
+
+    def cells(self, points: NDArray[np.floating[Any]]) -> NDArray[np.int64]:
+        """Cells (i, j) that hold points, both of shape (n, 2); points in metres.
+
+        Raises:
+            ValueError: If a point lies outside the maze; names the first.
+        """
         xmin, _, ymin, _ = self.extent
         cells = np.floor((points[:, ::-1] - (ymin, xmin)) / self.unit_m)
         inside = ((cells >= 0) & (cells < self.walls.shape)).all(axis=1)
         if not inside.all():
             self.cell(*points[np.flatnonzero(~inside)[0]].tolist())
-        counts = np.zeros(self.walls.shape, dtype=np.int64)
-        np.add.at(counts, tuple(cells.astype(np.int64).T), 1)
-        return counts
+        return cells.astype(np.int64)
 
     def free_cells(self) -> list[Cell]:
         """All free cells, row by row."""

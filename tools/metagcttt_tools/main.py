@@ -65,6 +65,7 @@ PROGRAMS: dict[str, Program | Group] = {
     'loss-curves': Program('loss_curves', 'Draw the losses of test-time training by part.'),
     'success-curve': Program('success_curve', 'Draw success over pre-training.'),
     'draw-episodes': Program('draw_episodes', 'Draw paths and retrieved data of episodes.'),
+    'draw-values': Program('draw_values', "Draw a critic's value of each place of a maze."),
     'top-view': Program('top_view', 'Draw a recording from above, or film it.'),
     'benchmark': Group(
         {

@@ -22,6 +22,10 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
     TrajectoryDataset.from_arrays(
         walks.observations[:half], walks.actions[:half], walks.terminals[:half]
     ).save(folder / 'half.npz')
+    for name, rows in (('inside', 2 * half), ('half-inside', half)):
+        TrajectoryDataset.from_arrays(
+            walks.observations[:rows].clip(-5, 25), walks.actions[:rows], walks.terminals[:rows]
+        ).save(folder / f'{name}.npz')
     for name, kind, seed in (
         ('gcbc', 'gcbc', 0),
         ('gciql', 'gciql', 0),

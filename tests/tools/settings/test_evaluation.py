@@ -9,6 +9,7 @@ from metagcttt_core.evaluation import offline, rollout
 from metagcttt_tools import (
     compare,
     draw_episodes,
+    draw_values,
     evaluate,
     evaluate_offline,
     loss_curves,
@@ -176,6 +177,25 @@ DRAW = Walk(
 )
 
 
+def watch_values(patch: pytest.MonkeyPatch, seen: Seen) -> None:
+    patch.setattr(draw_values, 'make_simulator', ShortSimulator)
+    patch.setattr(plots, 'save', lambda figure, path: seen.append(path))
+
+
+VALUES = Walk(
+    'draw-values',
+    {'dataset': '@inside.npz', 'checkpoint': '@gciql'},
+    {
+        'checkpoint': '@run-critic/snapshots/000001',
+        'dataset': '@half-inside.npz',
+        'rows': 40,
+        'seed': 1,
+        'out': 'elsewhere',
+    },
+    watch_values,
+)
+
+
 def watch_losses(patch: pytest.MonkeyPatch, seen: Seen) -> None:
     patch.setattr(loss_curves, 'make_simulator', ShortSimulator)
     patch.setattr(plots, 'save', lambda figure, path: seen.append(path))
@@ -280,7 +300,7 @@ COMPARE = Walk(
     watch_comparison,
 )
 
-WALKS = (EVALUATE, OFFLINE, SUCCESS_CURVE, DRAW, LOSSES, STUDY, REPORT, COMPARE)
+WALKS = (EVALUATE, OFFLINE, SUCCESS_CURVE, DRAW, VALUES, LOSSES, STUDY, REPORT, COMPARE)
 
 
 @walks_through(WALKS)

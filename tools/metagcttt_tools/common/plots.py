@@ -108,11 +108,7 @@ def demo_picture(
 
 def coverage_picture(maze: MazeMap, positions: np.ndarray, bins_per_cell: int = 8) -> Figure:
     """Heat map of the visits to each place; positions of shape (N, 2) in metres."""
-    xmin, xmax, ymin, ymax = maze.extent
-    rows, cols = (bins_per_cell * count for count in maze.walls.shape)
-    counts, _, _ = np.histogram2d(
-        positions[:, 1], positions[:, 0], (rows, cols), ((ymin, ymax), (xmin, xmax))
-    )
+    counts = _sums(maze, positions, bins_per_cell)
     figure = Figure(figsize=(4.6, 4), layout='constrained')
     axes = figure.subplots()
     draw_maze(axes, maze)
@@ -120,6 +116,45 @@ def coverage_picture(maze: MazeMap, positions: np.ndarray, bins_per_cell: int = 
     image = axes.imshow(visited, extent=maze.extent, origin='lower', norm='log', cmap='viridis')
     figure.colorbar(image, label=f'rows per square of {maze.unit_m / bins_per_cell:g} m')
     return figure
+
+
+def values_picture(
+    maze: MazeMap,
+    positions: np.ndarray,
+    tasks: Sequence[Mapping[str, Any]],
+    bins_per_cell: int = 4,
+) -> Figure:
+    """Mean value of the states at each place, one panel a task.
+
+    Args:
+        maze: The maze.
+        positions: Where the states are, (n, 2) metres.
+        tasks: Each with `task` (its number), `values` (n,), `goal` and `peaks`, points in metres.
+        bins_per_cell: Squares that a cell is divided into, along each side.
+    """
+    figure = Figure(figsize=(3.1 * len(tasks), 3.3), layout='constrained')
+    counts = _sums(maze, positions, bins_per_cell)
+    for axes, task in zip(np.atleast_1d(figure.subplots(1, len(tasks))), tasks, strict=True):
+        draw_maze(axes, maze)
+        sums = _sums(maze, positions, bins_per_cell, task['values'])
+        means = np.ma.masked_invalid(sums / np.where(counts, counts, np.nan))
+        image = axes.imshow(means, extent=maze.extent, origin='lower', cmap='viridis')
+        figure.colorbar(image, location='bottom')
+        axes.plot(*task['goal'], marker='*', color='gold', markeredgecolor='black', markersize=14)
+        for peak in task['peaks']:
+            axes.plot(*peak, marker='X', color=COLORS[0], markeredgecolor='white', markersize=10)
+        axes.set_title(f'task {task["task"]}')
+    return figure
+
+
+def _sums(
+    maze: MazeMap, positions: np.ndarray, bins_per_cell: int, values: np.ndarray | None = None
+) -> np.ndarray:
+    """Sum of values, or number, of the points in each square of the maze."""
+    xmin, xmax, ymin, ymax = maze.extent
+    bins = [bins_per_cell * count for count in maze.walls.shape]
+    y, x = positions[:, 1], positions[:, 0]
+    return np.histogram2d(y, x, bins, ((ymin, ymax), (xmin, xmax)), weights=values)[0]
 
 
 def places_picture(places: np.ndarray, x_name: str, y_name: str) -> Figure:
