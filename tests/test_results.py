@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 import re
 
-from metagcttt_core import success_statistics
 from metagcttt_tools import report
 from metagcttt_tools.common.differences import differences, paired_difference
 from metagcttt_tools.common.evidence import format_evidence, read_evidence
@@ -58,7 +57,6 @@ def test_results_come_from_committed_code():
     """Those of old that do not are listed, and no others."""
     names = {name for artefact in WITH_RESULTS for name in artefact.files}
     names |= {path.name for path in RESULTS.glob('*-cpu.json')}
-    names |= {path.name for path in RESULTS.glob('*-table3-*.json')}
     dirty = set()
     for name in names:
         results = read(name)
@@ -95,9 +93,10 @@ def test_pages_and_tables_are_those_of_the_results(tmp_path, capsys):
     assert page == format_evidence(EVIDENCE)
     assert page in capsys.readouterr().out
     assert page == (RESULTS / 'paper.md').read_text()
-    studies = sorted(path.stem for path in tmp_path.glob('*-study.md'))
-    assert len(studies) == 3
-    for name in studies:
+    files = {name for artefact in WITH_RESULTS for name in artefact.files}
+    studies = sorted(name for name in files if 'adaptations' in read(name))
+    assert len(studies) >= 4
+    for name in [study.removesuffix('.json') for study in studies]:
         assert (RESULTS / f'{name}.md').read_text() == (tmp_path / f'{name}.md').read_text()
         assert (tmp_path / f'{name}.png').read_bytes().startswith(b'\x89PNG')
 
@@ -112,6 +111,13 @@ TABLES = [
         'base': 'base', 'continual': 'CONTINUAL-TTT', 'fomaml': 'TT-FOMAML',
         'reptile': 'TT-REPTILE',
     }),
+    *(
+        ('docs/results/README.md', 'pointmaze-medium-navigate-table3.json', state, {
+            'base': f'base, {label}', 'continual': f'CONTINUAL-TTT, {label}',
+            'fomaml': f'TT-FOMAML, {label}', 'reptile': f'TT-REPTILE, {label}',
+        })
+        for state, label in (('fresh', 'fresh'), ('pretrained', 'of pre-training'))
+    ),
     ('docs/results/README.md', 'pointmaze-medium-stitch-study.json', 'full', {
         'base': 'actor and critic',
     }),
@@ -152,23 +158,6 @@ def test_table_of_both_precisions_in_the_guide():
             adapted = [p for p in result['curve'] if p['budget'] > 0]
             cells = [f'{p["success"]:.2f} ± {p["standard_error"]:.2f}' for p in adapted]
             assert f'| {label} | {precision} | {" | ".join(cells)} |' in text
-
-
-@pytest.mark.parametrize(
-    ('state', 'label'), [('fresh', 'fresh'), ('pretrained', 'of pre-training')]
-)
-def test_table_of_both_optimiser_states(state, label):
-    text = squeezed((RESULTS / 'README.md').read_text())
-    report = read(f'pointmaze-medium-navigate-table3-base-{state}.json')
-    assert report['settings']['ttt']['optimizer_state'] == state
-    assert len(report['results']) == 3
-    points = zip(*(result['curve'] for result in report['results']), strict=True)
-    rates = [success_statistics([p['success'] for p in seeds]) for seeds in points]
-    area = success_statistics([result['auc'] for result in report['results']])
-    cells = [f'{rate.mean:.2f} ± {rate.standard_error:.2f}' for rate in rates]
-    assert (
-        f'| {label} | {" | ".join(cells)} | {area.mean:.3f} ± {area.standard_error:.3f} |' in text
-    )
 
 
 @pytest.mark.parametrize(
