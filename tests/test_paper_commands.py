@@ -33,7 +33,8 @@ def in_miniature(study: str, file: Path) -> dict[str, Any]:
         {'outer_steps': 4, 'inner_steps': 2, 'batch_size': 16}
     )
     preset['evaluate'] |= {'budgets': [0, 2], 'episodes': 1, 'processes': 1}
-    preset['sweep'] |= {'curve_budgets': [0, 2]} if 'curve' in preset['sweep'] else {}
+    if 'curve' in preset['sweep']:
+        preset['sweep'] |= {'curve': [0.25], 'curve_budgets': [0, 2]}
     preset['sweep'] |= {'base': str(file), 'seeds': [0], 'arms': dict(arms[:1]), 'processes': 1}
     return preset
 

@@ -64,6 +64,14 @@ def study_of(preset, **different):
     return Study(SweepSettings.model_validate(values | different))
 
 
+def test_a_fraction_before_the_first_outer_step_is_refused(preset):
+    arms = {'short': {'meta': {'outer_steps': 4}}}
+    with pytest.raises(ValueError, match=r'arms.short: 0.1 of 4 outer steps is before the first'):
+        study_of(preset, arms=arms, curve=[0.1, 0.5], curve_budgets=[0, 1])
+    with pytest.raises(ValueError, match=r'arms.short: 0.01 of 4 outer steps is before the first'):
+        study_of(preset, arms={'short': {**arms['short'], 'snapshot': 0.01}})
+
+
 def test_budgets_along_the_curve_are_those_of_its_end(preset):
     with pytest.raises(ValueError, match=r'curve_budgets: 7 is not among .* \(0, 1\)'):
         study_of(preset, curve_budgets=[0, 7])

@@ -302,8 +302,15 @@ class Study:
         values |= {'meta': meta, 'seed': seed, 'checkpoint': base, 'out': folder, 'resume': True}
         if arm.actor_loss is not None:
             values['actor_loss'] = arm.actor_loss
-        kept = {round(meta.outer_steps * part) for part in (*self.settings.curve, arm.snapshot)}
-        kept.discard(meta.outer_steps)
+        parts = {
+            part: round(meta.outer_steps * part) for part in (*self.settings.curve, arm.snapshot)
+        }
+        for part, step in parts.items():
+            if step == 0:
+                raise ValueError(
+                    f'arms.{name}: {part:g} of {meta.outer_steps} outer steps is before the first'
+                )
+        kept = set(parts.values()) - {meta.outer_steps}
         if kept:
             values['snapshot_every'] = math.gcd(*kept)
         with _named(f'meta_train with arms.{name}'):
