@@ -21,9 +21,10 @@ STUDIES = sorted({artefact.preset for artefact in ARTEFACTS if artefact.preset})
 
 
 def in_miniature(study: str, file: Path) -> dict[str, Any]:
-    """The preset of a study, with one seed and its first arm, that keeps everything else."""
+    """The preset of a study, small: one seed, and the arms that commands name, else the first."""
     preset = load_preset(study)
-    arms = list(preset['sweep'].get('arms', {}).items())
+    arms = preset['sweep'].get('arms', {})
+    named = [arm for arm in arms if any(f'/{arm}-0' in line for line in COMMANDS)]
     preset['generate'] |= {'episodes': 30, 'rows_per_episode': 60, 'processes': 1}
     preset['pretrain'] |= {'hidden': [8]}
     preset['pretrain']['training'] |= {'steps': 2, 'batch_size': 16}
@@ -32,10 +33,12 @@ def in_miniature(study: str, file: Path) -> dict[str, Any]:
     preset['meta_train'].setdefault('meta', {}).update(
         {'outer_steps': 4, 'inner_steps': 2, 'batch_size': 16}
     )
+    preset['meta_train']['log_every'] = 1
     preset['evaluate'] |= {'budgets': [0, 2], 'episodes': 1, 'processes': 1}
     if 'curve' in preset['sweep']:
         preset['sweep'] |= {'curve': [0.25], 'curve_budgets': [0, 2]}
-    preset['sweep'] |= {'base': str(file), 'seeds': [0], 'arms': dict(arms[:1]), 'processes': 1}
+    preset['sweep'] |= {'base': str(file), 'seeds': [0], 'processes': 1}
+    preset['sweep']['arms'] = {arm: arms[arm] for arm in named or list(arms)[:1]}
     return preset
 
 
@@ -103,7 +106,8 @@ def test_commands_run(
         program, *arguments = shlex.split(line)
         assert program == 'metagcttt'
         main(arguments)
-    made = {path.name for path in (tmp_path / 'docs' / 'results').iterdir()}
+    results = tmp_path / 'docs' / 'results'
+    made = {str(path.relative_to(results)) for path in results.rglob('*')}
     for artefact in ARTEFACTS:
         if artefact.preset == study:
             assert {name for name in artefact.files if study in name} <= made

@@ -48,8 +48,8 @@ def test_results_are_of_so_many_training_seeds(artefact):
             counts = {len(arm['seeds']) for arm in arms}
         else:
             settings = results['settings']
-            runs = settings.get('runs') or settings.get('checkpoints') or [settings['checkpoint']]
-            counts = {len(runs)}
+            several = settings.get('runs') or settings.get('checkpoints')
+            counts = {len(several or [settings.get('run') or settings['checkpoint']])}
         assert artefact.seeds in counts, name
 
 
@@ -86,8 +86,10 @@ def test_differences_in_claims_are_those_of_the_results(artefact):
 
 def test_pages_and_tables_are_those_of_the_results(tmp_path, capsys):
     """`metagcttt report --paper` rebuilds what is committed."""
-    for path in [*RESULTS.glob('*.json'), RESULTS / 'paper.yaml']:
-        (tmp_path / path.name).write_bytes(path.read_bytes())
+    for path in [*RESULTS.rglob('*.json'), RESULTS / 'paper.yaml']:
+        copy = tmp_path / path.relative_to(RESULTS)
+        copy.parent.mkdir(exist_ok=True)
+        copy.write_bytes(path.read_bytes())
     report.main(['--paper', '--out', str(tmp_path)])
     page = (tmp_path / 'paper.md').read_text()
     assert page == format_evidence(EVIDENCE)

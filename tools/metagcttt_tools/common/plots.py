@@ -20,6 +20,7 @@ from sim_bridge.maze_map import MazeMap
 # Okabe and Ito's palette: told apart by colour-blind readers too.
 COLORS = ('#D55E00', '#0072B2', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
 _RETRIEVED = '#9a9a9a'
+_MANY_LINES = 8
 
 
 def draw_maze(axes: Axes, maze: MazeMap) -> None:
@@ -206,7 +207,9 @@ def success_curves(adaptations: Mapping[str, Mapping[str, Mapping[str, Any]]]) -
     Args:
         adaptations: By name and arm: `budgets`, `success` and `standard_error`, equally long.
     """
-    figure = Figure(figsize=(0.6 + 4.4 * len(adaptations), 3.6), layout='constrained')
+    crowded = max(len(arms) for arms in adaptations.values()) > _MANY_LINES
+    size = (0.6 + (6.0 if crowded else 4.4) * len(adaptations), 4.4 if crowded else 3.6)
+    figure = Figure(figsize=size, layout='constrained')
     panels = np.atleast_1d(figure.subplots(1, len(adaptations), sharey=True))
     for axes, (name, arms) in zip(panels, adaptations.items(), strict=True):
         budgets = sorted({budget for curve in arms.values() for budget in curve['budgets']})
@@ -217,7 +220,10 @@ def success_curves(adaptations: Mapping[str, Mapping[str, Mapping[str, Any]]]) -
         axes.set_xlabel('steps of test-time training K')
         if len(adaptations) > 1:
             axes.set_title(name)
-        if len(arms) > 1:
+        if crowded:
+            beside = {'loc': 'center left', 'bbox_to_anchor': (1, 0.5), 'fontsize': 'small'}
+            axes.legend(frameon=False, **beside)
+        elif len(arms) > 1:
             axes.legend(loc='best', frameon=False)
     panels[0].set_ylabel('success')
     return figure
@@ -268,7 +274,7 @@ def draw_line(
         number: Which line of the axes it is: the same number looks the same everywhere.
     """
     mean, low, high = values
-    color, style = COLORS[number % len(COLORS)], _choose(('-', '--', ':'), number)
+    color, style = COLORS[number % len(COLORS)], _choose(('-', '--', ':', '-.'), number)
     axes.plot(x, mean, color=color, linestyle=style, marker='o', markersize=3.5, label=label)
     axes.fill_between(x, low, high, color=color, alpha=0.15, linewidth=0)
     axes.grid(alpha=0.25)
@@ -286,7 +292,8 @@ def interquartile_picture(adaptations: Mapping[str, Mapping[str, Any]]) -> Figur
         adaptations: By name of the adaptation and of the arm its summary, with `robust`.
     """
     rows = len(adaptations)
-    figure = Figure(figsize=(11, 3.4 * rows), layout='constrained')
+    height = max(3.4, *(0.24 * len(arms) for arms in adaptations.values()))  # of the legend
+    figure = Figure(figsize=(11, height * rows), layout='constrained')
     panels = figure.subplots(rows, 2, squeeze=False)
     for row, (name, arms) in zip(panels, adaptations.items(), strict=True):
         for number, (arm, summary) in enumerate(arms.items()):
@@ -301,7 +308,7 @@ def interquartile_picture(adaptations: Mapping[str, Mapping[str, Any]]) -> Figur
                         yerr=(value - low, high - value),
                         color=COLORS[number % len(COLORS)],
                         label=arm,
-                        marker=_choose(('o', 's', '^'), number),
+                        marker=_choose(('o', 's', '^', 'D'), number),
                         markersize=4,
                         linestyle='',
                     )
@@ -314,6 +321,7 @@ def interquartile_picture(adaptations: Mapping[str, Mapping[str, Any]]) -> Figur
             loc='upper left',
             bbox_to_anchor=(1, 1),
             frameon=False,
+            fontsize='small',
         )
         row[1].set_title('probability of improvement over the base')
         row[1].axhline(0.5, color='grey', linewidth=0.8)
