@@ -141,6 +141,19 @@ def test_tables_of_studies_in_the_documents(document, name, adaptation, labels):
         assert f'| {label} | {" | ".join(cells)} | {area} |' in text
 
 
+def test_table_of_early_stopping():
+    text = squeezed((RESULTS / 'README.md').read_text())
+    arms = read('pointmaze-medium-navigate-stopping.json')['adaptations']['ttt']
+    for label, suffix in (
+        *((k, k) for k in ('1', '10', '50', '200')),
+        ('up to 200, stopped early', 'stop'),
+        *((f'the same at {rate}', rate) for rate in ('3e-5', '3e-3')),
+    ):
+        found = [arms.get(f'{name}-{suffix}') for name in ('continual', 'fomaml', 'reptile')]
+        cells = [arm and f'{arm["auc"]:.3f} ± {arm["auc_error"]:.3f}' or '' for arm in found]
+        assert f'| {" | ".join([label, *cells])} |'.replace('  ', ' ') in text
+
+
 def test_table_of_the_small_policies_in_the_readme():
     text = squeezed((ROOT / 'README.md').read_text())
     results = read('pointmaze-medium-navigate-cpu.json')['results']
