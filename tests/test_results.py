@@ -150,7 +150,7 @@ def test_table_of_early_stopping():
         *((f'the same at {rate}', rate) for rate in ('3e-5', '3e-3')),
     ):
         found = [arms.get(f'{name}-{suffix}') for name in ('continual', 'fomaml', 'reptile')]
-        cells = [arm and f'{arm["auc"]:.3f} ± {arm["auc_error"]:.3f}' or '' for arm in found]
+        cells = [f'{arm["auc"]:.3f} ± {arm["auc_error"]:.3f}' if arm else '' for arm in found]
         assert f'| {" | ".join([label, *cells])} |'.replace('  ', ' ') in text
 
 
