@@ -119,7 +119,7 @@ def test_a_machine_that_dies_costs_no_bit_of_the_results(make_scheduler, tmp_pat
 def test_a_stopped_training_saves_and_the_next_call_goes_on(make_scheduler, tmp_path):
     """Ray blocks SIGINT in its workers, and so in what they start."""
     maze_walks().save(tmp_path / 'walks.npz')
-    run, steps = tmp_path / 'run-0', 200_000  # more than it takes while it is stopped
+    run, steps = tmp_path / 'run-0', 10_000_000  # more than it takes while it is stopped
 
     for _ in range(2):
         before, stop = last_step(run), Stop()

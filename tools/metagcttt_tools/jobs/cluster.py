@@ -5,6 +5,7 @@ from functools import partial
 import logging
 import os
 import socket
+import time
 from typing import Any
 
 import ray
@@ -14,6 +15,7 @@ from metagcttt_tools.jobs.program import JobError, JobLostError, JobStoppedError
 from metagcttt_tools.jobs.scheduler import Job, Resources
 
 _ANSWER_S = 10.0
+_ASK_AGAIN_S = 5.0
 
 
 class RayScheduler:
@@ -50,6 +52,7 @@ class RayScheduler:
             for kind in ('CPU', 'GPU', 'memory')
         }
         self._tasks: list[ray.ObjectRef[None]] = []
+        self._asks_again_at = 0.0
 
     def submit(self, job: Job) -> Future[None]:
         """Queue a job.
@@ -82,10 +85,15 @@ class RayScheduler:
         return future
 
     def stop(self) -> None:
-        """Make running jobs save and end, and start no more."""
+        """Make running jobs save and end, and start no more.
+
+        Called again, it asks again: while Ray notices that a machine died, a request can be lost.
+        """
+        if time.monotonic() < self._asks_again_at:
+            return
+        self._asks_again_at = time.monotonic() + _ASK_AGAIN_S
         for task in self._tasks:
             ray.cancel(task)
-        self._tasks = []
 
 
 def _check_address() -> None:
