@@ -19,7 +19,7 @@ TRUE = np.array([[-1.0, -2.0, -3.0], [0.0, np.nan, -4.0]])
 
 def test_a_cell_has_the_mean_of_its_states():
     points = np.array([MAZE.center(0, 0), MAZE.center(0, 0), MAZE.center(1, 2)])
-    found = cell_values(MAZE, points, np.array([-1.0, -2.0, -5.0]))
+    found = cell_values(MAZE, MAZE.cells(points), np.array([-1.0, -2.0, -5.0]))
     np.testing.assert_array_equal(found[0], [-1.5, np.nan, np.nan])
     assert found[1, 2] == -5.0
 

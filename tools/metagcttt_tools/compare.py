@@ -1,16 +1,23 @@
 """One table and picture of evaluations: other agents, data or settings of test-time training."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from metagcttt_core import success_statistics
-from metagcttt_core.config import error_lines, Settings
-from metagcttt_core.files import read_json
-from pydantic import Field, ValidationError
+from metagcttt_core.config import Settings
+from pydantic import Field
 
 from metagcttt_tools.common.cli import fail, parse
-from metagcttt_tools.common.results import beside, markdown_table, Results, write_report
+from metagcttt_tools.common.results import (
+    beside,
+    markdown_table,
+    read_results,
+    Results,
+    success_cells,
+    write_report,
+)
+from metagcttt_tools.common.resume import flat
 from metagcttt_tools.common.session import sole_writer
 
 _DESCRIPTION = """Compare evaluations in one table and picture.
@@ -42,7 +49,7 @@ def main(argv: list[str] | None = None) -> None:
     if not settings.evaluations:
         fail('name evaluations to compare: --evaluations NAME FILE NAME FILE')
     try:
-        files = {name: read_evaluation(path) for name, path in settings.evaluations.items()}
+        files = {name: read_results(path) for name, path in settings.evaluations.items()}
         lines = {name: line(file, settings.policies) for name, file in files.items()}
     except ValueError as error:
         fail(str(error))
@@ -56,18 +63,6 @@ def main(argv: list[str] | None = None) -> None:
         rows = [{'setting': setting, **values} for setting, values in apart.items()]
         print(f'\nThey differ in:\n\n{markdown_table(rows)}')
     print(f'results: {record}\npicture: {picture}')
-
-
-def read_evaluation(path: Path) -> Results:
-    """The results in a file of `metagcttt evaluate`.
-
-    Raises:
-        ValueError: If it is none; names the file and what is wrong.
-    """
-    try:
-        return Results.model_validate(read_json(path))
-    except ValidationError as error:
-        raise ValueError(f'{path}: {"; ".join(error_lines(error))}') from error
 
 
 def line(evaluation: Results, policies: str = '') -> dict[str, Any]:
@@ -106,20 +101,14 @@ def settings_apart(settings: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[
 
     One that a file lacks, for it is older than the setting, has no value and makes no difference.
     """
-    flat = {name: _flat(each) for name, each in settings.items()}
-    names = dict.fromkeys(name for each in flat.values() for name in each)
-    values = {name: {key: each.get(name, '') for key, each in flat.items()} for name in names}
+    each_flat = {name: flat(each) for name, each in settings.items()}
+    names = dict.fromkeys(name for each in each_flat.values() for name in each)
+    values = {
+        name: {key: str(each.get(name, '')) for key, each in each_flat.items()}
+        for name in names
+        if name not in _NOT_COMPARED
+    }
     return {name: each for name, each in values.items() if len(set(each.values()) - {''}) > 1}
-
-
-def _flat(settings: Mapping[str, Any], prefix: str = '') -> dict[str, str]:
-    found: dict[str, str] = {}
-    for name, value in settings.items():
-        if isinstance(value, Mapping):
-            found |= _flat(value, f'{prefix}{name}.')
-        elif name not in _NOT_COMPARED:
-            found[prefix + name] = str(value)
-    return found
 
 
 def format_lines(lines: Mapping[str, Mapping[str, Any]]) -> str:
@@ -130,16 +119,9 @@ def format_lines(lines: Mapping[str, Mapping[str, Any]]) -> str:
             {
                 'evaluation': name,
                 'policies': len(each['checkpoints']),
-                **{f'K = {budget}': _cell(each, budget) for budget in budgets},
+                **{f'K = {budget}': '' for budget in budgets},
+                **success_cells(each),
             }
             for name, each in lines.items()
         ]
     )
-
-
-def _cell(line: Mapping[str, Any], budget: int) -> str:
-    budgets: Sequence[int] = line['budgets']
-    if budget not in budgets:
-        return ''
-    place = budgets.index(budget)
-    return f'{line["success"][place]:.2f} ± {line["standard_error"][place]:.2f}'

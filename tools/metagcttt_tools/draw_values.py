@@ -66,7 +66,7 @@ def _run(settings: DrawValuesSettings, record: Path, picture: Path) -> None:
         maze, position_dims = simulator.maze, simulator.spec.position_dims
         positions = observations[:, position_dims]
         try:
-            maze.cells(positions)
+            cells = maze.cells(positions)
         except ValueError as error:
             raise ValueError(f'{settings.dataset} is not of {environment}: {error}') from error
         panels: list[dict[str, Any]] = []
@@ -74,7 +74,7 @@ def _run(settings: DrawValuesSettings, record: Path, picture: Path) -> None:
             goal = simulator.reset(task.task_id, settings.seed)[1]
             values = agent.value_fn(observations, goal)
             place = tuple(goal[list(position_dims)].tolist())
-            of_cells = cell_values(maze, positions, values)
+            of_cells = cell_values(maze, cells, values)
             peaks = false_peaks(maze, of_cells, maze.cell(*place))
             panels.append(
                 {
@@ -103,18 +103,18 @@ def _run(settings: DrawValuesSettings, record: Path, picture: Path) -> None:
 
 
 def cell_values(
-    maze: MazeMap, positions: NDArray[np.floating[Any]], values: NDArray[np.floating[Any]]
+    maze: MazeMap, cells: NDArray[np.int64], values: NDArray[np.floating[Any]]
 ) -> NDArray[np.float64]:
     """Mean value of the states in each cell, (rows, cols); NaN where there are none.
 
     Args:
         maze: The maze.
-        positions: (n, 2) metres.
+        cells: Of the states, (n, 2).
         values: (n,).
     """
-    sums = np.zeros(maze.walls.shape)
-    np.add.at(sums, tuple(maze.cells(positions).T), values)
-    counts = maze.count_visits(positions)
+    sums, counts = np.zeros((2, *maze.walls.shape))
+    np.add.at(sums, tuple(cells.T), values)
+    np.add.at(counts, tuple(cells.T), 1)
     return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
 

@@ -6,7 +6,7 @@ import shlex
 from typing import Any
 
 from metagcttt_core import normalized_auc, success_statistics
-from metagcttt_core.config import error_lines, Settings
+from metagcttt_core.config import Settings
 from metagcttt_core.evaluation import (
     adaptation_efficiency,
     interquartile_mean,
@@ -16,14 +16,20 @@ from metagcttt_core.evaluation import (
 )
 from metagcttt_core.files import read_json, write_json, write_text
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 import tyro
 
 from metagcttt_tools.common.cli import fail, parse
 from metagcttt_tools.common.differences import differences
 from metagcttt_tools.common.evidence import format_evidence, read_evidence
 from metagcttt_tools.common.manifest import BASE, Evaluation, FILE, Manifest, Policy
-from metagcttt_tools.common.results import beside, markdown_table, Point, Results
+from metagcttt_tools.common.results import (
+    beside,
+    markdown_table,
+    Point,
+    read_results,
+    success_cells,
+)
 from metagcttt_tools.common.session import sole_writer
 
 _DESCRIPTION = """Tables and figures of a study that metagcttt sweep ran.
@@ -225,11 +231,9 @@ def _curves(folder: Path, evaluation: Evaluation) -> list[tuple[Policy, Sequence
     """Each policy of an evaluation with its results."""
     path = folder / evaluation.file
     try:
-        results = Results.model_validate(read_json(path)).results
+        results = read_results(path).results
     except FileNotFoundError as error:
         raise ValueError(f'{path} does not exist: run metagcttt sweep to its end first') from error
-    except ValidationError as error:
-        raise ValueError(f'{path}: {"; ".join(error_lines(error))}') from error
     if len(results) != len(evaluation.policies):
         raise ValueError(
             f'{path}: holds results of {len(results)} policies, '
@@ -318,7 +322,7 @@ def _success_table(arms: dict[str, Any]) -> str:
             {
                 'policy': name,
                 'seeds': len(arm['seeds']),
-                **_cells(arm),
+                **success_cells(arm),
                 'AUC': '' if arm['auc'] is None else f'{arm["auc"]:.3f} ± {arm["auc_error"]:.3f}',
                 'AUC by seed': ', '.join(f'{value:.3f}' for value in arm['auc_per_seed']),
                 'efficiency': _ratio(arm['efficiency']),
@@ -373,13 +377,8 @@ def _robust_table(arms: dict[str, Any]) -> str:
 def _curve_table(curve: dict[str, Any]) -> str:
     return markdown_table(
         [
-            {'policy': arm, 'outer steps': f'{fraction:.0%}', **_cells(point)}
+            {'policy': arm, 'outer steps': f'{fraction:.0%}', **success_cells(point)}
             for arm, points in curve.items()
             for fraction, point in points.items()
         ]
     )
-
-
-def _cells(summary: dict[str, Any]) -> dict[str, str]:
-    rates = zip(summary['budgets'], summary['success'], summary['standard_error'], strict=True)
-    return {f'K = {budget}': f'{mean:.2f} ± {error:.2f}' for budget, mean, error in rates}

@@ -289,7 +289,7 @@ def watch_comparison(patch: pytest.MonkeyPatch, seen: Seen) -> None:
         policies = [{'checkpoint': name, 'curve': curve} for name in ('base-0', 'reptile-0')]
         return Results(results=policies)
 
-    patch.setattr(compare, 'read_evaluation', read)
+    patch.setattr(compare, 'read_results', read)
     patch.setattr(plots, 'save', lambda figure, path: seen.append(path))
 
 

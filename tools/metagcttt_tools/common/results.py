@@ -1,14 +1,15 @@
 """Results of programs: Markdown tables and JSON reports."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 import os
 from pathlib import Path
 import platform
 from typing import Annotated, Any
 
-from metagcttt_core.config import Settings
-from metagcttt_core.files import refuse_foreign, write_json
-from pydantic import BaseModel, Field
+from metagcttt_core.config import error_lines, Settings
+from metagcttt_core.files import read_json, refuse_foreign, write_json
+from pydantic import BaseModel, Field, ValidationError
 
 from metagcttt_tools.common.session import provenance
 
@@ -41,6 +42,25 @@ class Benchmark(Settings, ABC):
     @abstractmethod
     def run(self) -> None:
         """Measure, print a table and write JSON."""
+
+
+def read_results(path: Path) -> Results:
+    """The results in a file of `metagcttt evaluate`.
+
+    Raises:
+        FileNotFoundError: If there is none.
+        ValueError: If it is malformed; names the file and what is wrong.
+    """
+    try:
+        return Results.model_validate(read_json(path))
+    except ValidationError as error:
+        raise ValueError(f'{path}: {"; ".join(error_lines(error))}') from error
+
+
+def success_cells(summary: Mapping[str, Any]) -> dict[str, str]:
+    """Success by budget as cells of a table; of a summary with `budgets` and their figures."""
+    rates = zip(summary['budgets'], summary['success'], summary['standard_error'], strict=True)
+    return {f'K = {budget}': f'{mean:.2f} ± {error:.2f}' for budget, mean, error in rates}
 
 
 def beside(out: Path, ending: str) -> Path:

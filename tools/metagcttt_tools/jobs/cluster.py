@@ -87,7 +87,7 @@ class RayScheduler:
     def stop(self) -> None:
         """Make running jobs save and end, and start no more.
 
-        Called again, it asks again: while Ray notices that a machine died, a request can be lost.
+        Called again, it asks again, should a request have been lost.
         """
         if time.monotonic() < self._asks_again_at:
             return
